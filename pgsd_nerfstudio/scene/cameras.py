@@ -1,0 +1,78 @@
+"""Pinhole cameras of one clip or one capture, in the convention of the rasterizers.
+
+OpenCV axes (x right, y down, z forward), world to camera. nerfstudio's own cameras are OpenGL, camera to world
+(x right, y up, z back): `Cameras.from_opengl` and `Cameras.opengl` convert.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """T pinhole cameras of one image size."""
+
+    viewmats: Float[Tensor, "t 4 4"]
+    """World to camera, OpenCV axes, scene units."""
+    Ks: Float[Tensor, "t 3 3"]
+    """Intrinsics in pixels; pixel centres lie at half-integers."""
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.viewmats.shape[0]
+
+    def __getitem__(self, index: int | slice | Tensor) -> Cameras:
+        """Some of the cameras; a single index keeps the leading dimension."""
+        if isinstance(index, int):
+            index = [index]  # type: ignore[assignment]
+        return Cameras(self.viewmats[index], self.Ks[index], self.width, self.height)
+
+    @staticmethod
+    def from_opengl(c2w: Float[Tensor, "t 3|4 4"], Ks: Float[Tensor, "t 3 3"], width: int, height: int) -> Cameras:
+        """From nerfstudio's camera-to-world matrices."""
+        full = torch.eye(4).repeat(c2w.shape[0], 1, 1).to(c2w)
+        full[:, :3] = c2w[:, :3]
+        return Cameras(torch.linalg.inv(full @ OPENGL_TO_OPENCV.to(c2w)), Ks, width, height)
+
+    def opengl(self) -> Float[Tensor, "t 4 4"]:
+        """Camera-to-world matrices with nerfstudio's axes."""
+        return torch.linalg.inv(self.viewmats) @ OPENGL_TO_OPENCV.to(self.viewmats)
+
+    @property
+    def centers(self) -> Float[Tensor, "t 3"]:
+        """Camera positions in scene units."""
+        return torch.linalg.inv(self.viewmats)[:, :3, 3]
+
+    def to(self, device: torch.device | str) -> Cameras:
+        return Cameras(self.viewmats.to(device), self.Ks.to(device), self.width, self.height)
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same views in another image size: the wider of the two fields of view is cropped, never stretched."""
+        zoom = max(width / self.width, height / self.height)
+        Ks = self.Ks.clone()
+        Ks[:, 0, 0] *= zoom
+        Ks[:, 1, 1] *= zoom
+        Ks[:, 0, 2] = (Ks[:, 0, 2] - self.width / 2) * zoom + width / 2
+        Ks[:, 1, 2] = (Ks[:, 1, 2] - self.height / 2) * zoom + height / 2
+        return Cameras(self.viewmats, Ks, width, height)
+
+
+def interpolate(cameras: Cameras, first: int, last: int, frames: int) -> Cameras:
+    """`frames` cameras on the way from one view to another: straight centres, shortest rotation (slerp)."""
+    poses = cameras.opengl()[[first, last]]
+    at = torch.linspace(0.0, 1.0, frames, dtype=poses.dtype, device=poses.device)
+    quats = roma.rotmat_to_unitquat(poses[:, :3, :3])
+    rotation = roma.unitquat_to_rotmat(roma.unitquat_slerp(quats[0], quats[1], at, shortest_arc=True))
+    center = torch.lerp(poses[0, :3, 3], poses[1, :3, 3], at[:, None])
+    c2w = torch.cat([rotation, center[:, :, None]], dim=2)
+    Ks = torch.lerp(cameras.Ks[first], cameras.Ks[last], at[:, None, None])
+    return Cameras.from_opengl(c2w, Ks, cameras.width, cameras.height)

@@ -1,0 +1,81 @@
+"""The record every room hands on: a set of 3D Gaussians.
+
+Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023). Values are the activated ones (linear
+scales, opacities in 0..1), not the logarithms and logits that checkpoints store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians; all tensors share device and dtype."""
+
+    means: Float[Tensor, "n 3"]
+    """Centres, in the units of the frame they live in (scene units, or metres where the owner says so)."""
+    quats: Float[Tensor, "n 4"]
+    """Rotations as wxyz quaternions; consumers normalise."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the three axes, same units as the means."""
+    opacities: Float[Tensor, "n"]
+    """Peak opacities, 0..1."""
+    colors: Tensor
+    """[N, 3] plain RGB in 0..1, or [N, K, 3] spherical harmonics with K = (degree + 1)^2, as in splatfacto."""
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+        for name, shape in expected.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"Gaussians.{name} must have shape {shape}, found {found}")
+        if self.colors.shape[0] != n or self.colors.shape[-1] != 3 or self.colors.ndim not in (2, 3):
+            raise ValueError(f"Gaussians.colors must be [{n}, 3] or [{n}, K, 3], found {tuple(self.colors.shape)}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int | None:
+        """Degree of the spherical harmonics, None where the colours are plain RGB."""
+        return None if self.colors.ndim == 2 else round(self.colors.shape[1] ** 0.5) - 1
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    def to(self, *args, **kwargs) -> Gaussians:
+        """The same Gaussians on another device or in another dtype; arguments as for `Tensor.to`."""
+        return replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+
+    def detach(self) -> Gaussians:
+        return replace(self, **{f.name: getattr(self, f.name).detach() for f in fields(self)})
+
+    def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> Gaussians:
+        """The chosen Gaussians, by mask or by index."""
+        return replace(self, **{f.name: getattr(self, f.name)[which] for f in fields(self)})
+
+    def check_finite(self) -> None:
+        """Raises ValueError that names the first field with a NaN or infinity."""
+        for f in fields(self):
+            bad = int((~torch.isfinite(getattr(self, f.name))).sum())
+            if bad:
+                raise ValueError(f"{bad} values of the Gaussians' {f.name} are NaN or infinite")
+
+    @staticmethod
+    def empty(device: torch.device | str = "cpu") -> Gaussians:
+        """No Gaussians, plain RGB."""
+        z = torch.zeros
+        return Gaussians(z(0, 3, device=device), z(0, 4, device=device), z(0, 3, device=device), z(0, device=device), z(0, 3, device=device))
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """One set from several of the same colour kind (all RGB, or all of one SH degree)."""
+    return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))

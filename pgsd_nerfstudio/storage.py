@@ -1,0 +1,96 @@
+"""Content-addressed storage of what is costly to make: meshes, motion priors, the demo scene.
+
+A file is named by the hash of everything it was made from, so a stale one is never read. Files are written beside and then
+renamed: a half-written file never carries the final name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+
+def cache_dir() -> Path:
+    """Where made things are kept: $PGSD_CACHE, else ~/.cache/pgsd_nerfstudio."""
+    return Path(os.environ.get("PGSD_CACHE") or Path.home() / ".cache" / "pgsd_nerfstudio")
+
+
+def content_key(*parts: Any) -> str:
+    """Hash of tensors, arrays, dataclasses, paths and plain values: 16 hex digits.
+
+    Raises:
+        TypeError: a part is of a kind that has no stable content.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        _feed(digest, part)
+    return digest.hexdigest()[:16]
+
+
+def _feed(digest: Any, part: Any) -> None:
+    if isinstance(part, Tensor):
+        part = part.detach().cpu().contiguous().numpy()
+    if isinstance(part, np.ndarray):
+        digest.update(f"{part.dtype}{part.shape}".encode())
+        digest.update(np.ascontiguousarray(part).data)
+    elif is_dataclass(part) and not isinstance(part, type):
+        digest.update(type(part).__name__.encode())
+        for name in part.__dataclass_fields__:
+            digest.update(name.encode())
+            _feed(digest, getattr(part, name))
+    elif isinstance(part, Mapping):
+        for key in sorted(part):
+            _feed(digest, key)
+            _feed(digest, part[key])
+    elif isinstance(part, list | tuple):
+        digest.update(f"[{len(part)}".encode())
+        for item in part:
+            _feed(digest, item)
+    elif part is None or isinstance(part, str | bytes | int | float | bool | Path):
+        digest.update(f"{type(part).__name__}:{part!r};".encode())
+    else:
+        raise TypeError(f"no stable content hash for a {type(part).__name__}")
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
+    """Write tensors and a JSON-able description as one safetensors file, atomically.
+
+    Raises:
+        OSError: the file could not be written (disk full, no permission); nothing is left behind.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        data = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        save_file(data, beside, metadata={"about": json.dumps(asdict(about) if is_dataclass(about) else dict(about or {}))})
+        os.replace(beside, path)
+    except (OSError, SafetensorError) as error:
+        beside.unlink(missing_ok=True)
+        raise OSError(f"could not write {path}: {error}; free some space or set PGSD_CACHE to a folder on another disk") from error
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """Tensors and description of a stored file; None where there is none, or where it is damaged (then it is removed)."""
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, framework="pt") as stored:
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}
+            return tensors, json.loads((stored.metadata() or {}).get("about", "{}"))
+    except (SafetensorError, OSError, json.JSONDecodeError):
+        path.unlink(missing_ok=True)
+        return None
+
+
+__all__ = ["cache_dir", "content_key", "load_tensors", "save_tensors"]
