@@ -1,0 +1,120 @@
+"""One door for every kind of scene: a splatfacto run, its config.yml, a checkpoint, a 3DGS .ply, or the built-in demo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.capture import in_run, read_capture
+from pgsd_nerfstudio.scene.frame import estimate_frame
+from pgsd_nerfstudio.scene.scene import Scene, SceneError
+from pgsd_nerfstudio.scene.splats import read_checkpoint, read_ply
+
+RunCameras = Callable[[Path], tuple[Cameras, tuple[Path, ...]]]
+"""Cameras (in the coordinates of the splat) and photographs of a run, from its config.yml."""
+
+# Names of files and folders that say nothing about the scene in them.
+NAMELESS = {"data", "pointcloud", "splat", "scene", "output", "outputs", "export", "exports", "images", "nerfstudio"}
+
+
+def load_scene(
+    path: str | Path,
+    data: str | Path | None = None,
+    *,
+    metres_per_unit: float | None = None,
+    description: str | None = None,
+    run_cameras: RunCameras | None = None,
+) -> Scene:
+    """A scene from any of its forms, with cameras and metric frame.
+
+    Args:
+        path: "demo", a splatfacto run folder, its config.yml, a .ckpt of it, or a 3DGS .ply.
+        data: transforms.json or its folder. A .ply needs it (its coordinates are taken to be those of the poses there, unless
+            `data` is a splatfacto run, whose coordinates it then shares, as ns-export writes them); for a run it replaces the
+            run's own data, moved by the run's dataparser_transforms.json.
+        metres_per_unit: length of a scene unit, where it is known.
+        description: what prompts call the scene ("a garden"); made from its name where not given.
+        run_cameras: reads the cameras of a run with the run's own dataparser.
+
+    Raises:
+        SceneError: the input cannot be used; the sentence says why and what to do.
+    """
+    if metres_per_unit is not None and not metres_per_unit > 0:
+        raise SceneError(f"metres per scene unit must be a positive number, got {metres_per_unit}")
+    if str(path) == "demo":
+        return _demo(metres_per_unit, description)
+    path, data = Path(path).expanduser(), None if data is None else Path(data).expanduser()
+    if not path.exists():
+        raise SceneError(f"no scene at {path}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
+    if data is not None and not data.exists():
+        raise SceneError(f"no data at {data}: expected nerfstudio's transforms.json or its folder")
+    if path.suffix.lower() == ".ply":
+        gaussians = read_ply(path)
+        cameras, images = _ply_cameras(path, data, run_cameras)
+        name = path.stem
+    else:
+        checkpoint, run = _checkpoint(path)
+        gaussians = read_checkpoint(checkpoint)
+        cameras, images = _run_cameras(run, data, run_cameras)
+        name = run.parent.parent.name if run.parent.name == "splatfacto" else run.name
+    frame = estimate_frame(cameras, gaussians, metres_per_unit)
+    return Scene(name or "scene", gaussians, cameras, frame, images, description or _described(name))
+
+
+def _demo(metres_per_unit: float | None, description: str | None) -> Scene:
+    from pgsd_nerfstudio.scene.demo import demo_scene
+
+    scene = demo_scene()
+    if metres_per_unit is not None:
+        frame = replace(scene.frame, metres_per_unit=metres_per_unit, source=f"{scene.frame.source}; scale as given")
+        scene = replace(scene, frame=frame)
+    return scene if description is None else replace(scene, description=description)
+
+
+def _checkpoint(path: Path) -> tuple[Path, Path]:
+    """The newest checkpoint that a run folder, config.yml or .ckpt stands for, and the run's folder."""
+    if path.suffix == ".ckpt":
+        return path, path.resolve().parent.parent
+    run = path.resolve() if path.is_dir() else path.resolve().parent
+    if path.is_file() and path.name != "config.yml":
+        raise SceneError(f"{path} is no scene: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
+    checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
+    if not checkpoints:
+        raise SceneError(f"{run} is no trained run: expected nerfstudio_models/step-*.ckpt in it, found none")
+    return checkpoints[-1], run
+
+
+def _ply_cameras(path: Path, data: Path | None, run_cameras: RunCameras | None) -> tuple[Cameras, tuple[Path, ...]]:
+    if data is None:
+        raise SceneError(f"{path} holds no cameras: pass --data with the transforms.json that it was trained on")
+    config = data / "config.yml" if data.is_dir() else data
+    if config.name == "config.yml" and config.is_file() and not (data / "transforms.json").is_file():
+        return _run_cameras(config.resolve().parent, None, run_cameras)
+    return read_capture(data)
+
+
+def _run_cameras(run: Path, data: Path | None, run_cameras: RunCameras | None) -> tuple[Cameras, tuple[Path, ...]]:
+    if data is not None:
+        cameras, images = read_capture(data)
+        return in_run(cameras, data, run / "dataparser_transforms.json"), images
+    config = run / "config.yml"
+    if not config.is_file():
+        raise SceneError(f"cameras are missing: there is no {config}; pass --data with the transforms.json it was trained on")
+    if run_cameras is None:
+        raise SceneError(f"only nerfstudio reads the cameras of {run}; pass --data with the transforms.json it was trained on")
+    cameras, images = run_cameras(config)
+    if len(cameras) == 0:
+        raise SceneError(f"{config} leads to data without cameras; pass --data with the transforms.json it was trained on")
+    return cameras, images
+
+
+def _described(name: str) -> str:
+    """The name with its article where it is a plain word, as in prompts: "a garden"."""
+    if not name.isalpha() or name.lower() in NAMELESS:
+        return "a scene"
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name.lower()}"
+
+
+__all__ = ["RunCameras", "Scene", "SceneError", "load_scene"]
