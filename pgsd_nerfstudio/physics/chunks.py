@@ -1,0 +1,172 @@
+"""A run in pieces: what a chunk of frames yields, how it is stored, how chunks become one history."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from pgsd_nerfstudio.physics.clock import Clock
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
+
+LANDED, SLID, LEFT = 0, 1, 2  # how a particle ended; what ended none of these ways is still in the air
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """n particles in the air; what one of them needs to fly on."""
+
+    ids: Int[ndarray, "n"]
+    positions: Float[ndarray, "n 3"]
+    velocities: Float[ndarray, "n 3"]
+    diameters: Float[ndarray, "n"]
+    speeds: Float[ndarray, "n"]
+    """Terminal, m/s."""
+    sways: Float[ndarray, "n"]
+    """Flutter: speed in m/s, rate in Hz, phase in turns."""
+    hertz: Float[ndarray, "n"]
+    phases: Float[ndarray, "n"]
+    holds: Float[ndarray, "n"]
+    """Draw from 0..1 that decides whether it stays on a slope."""
+    spins: Float[ndarray, "n"]
+    """Turns about the normal when it lies."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, which: ndarray) -> Bodies:
+        return Bodies(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @staticmethod
+    def join(parts: Sequence[Bodies]) -> Bodies:
+        return Bodies(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Bodies)))
+
+    @staticmethod
+    def none() -> Bodies:
+        widths = {"positions": (0, 3), "velocities": (0, 3)}
+        return Bodies(*(np.zeros(widths.get(f.name, 0), np.int32 if f.name == "ids" else np.float32) for f in fields(Bodies)))
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything the next frame depends on."""
+
+    bodies: Bodies
+    born: int
+    """Particles so far; the next id."""
+    carry: float
+    """Fraction of a particle that is due at the top."""
+
+    @staticmethod
+    def empty() -> State:
+        return State(Bodies.none(), 0, 0.0)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What happened in `frames` frames from `start` on."""
+
+    start: int
+    frames: int
+    row_ids: Int[ndarray, "m"]
+    """Particle of each row; rows are ordered by frame."""
+    row_frames: Int[ndarray, "m"]
+    row_positions: Float[ndarray, "m 3"]
+    births: Int[ndarray, "b"]
+    """Of the particles born in this chunk, whose ids follow on from the chunk before."""
+    diameters: Float[ndarray, "b"]
+    represents: Float[ndarray, "b"]
+    quats: Float[ndarray, "b 4"]
+    ended_ids: Int[ndarray, "e"]
+    ended_frames: Int[ndarray, "e"]
+    """Exclusive end of the active frames."""
+    ended_how: Int[ndarray, "e"]
+    rest_ids: Int[ndarray, "h"]
+    """Of those that landed."""
+    rest_positions: Float[ndarray, "h 3"]
+    rest_quats: Float[ndarray, "h 4"]
+    rest_extents: Float[ndarray, "h"]
+    state: State
+    """At the end of the chunk."""
+
+
+_ARRAYS = tuple(f.name for f in fields(Chunk) if f.name not in ("start", "frames", "state"))
+
+
+def _path(folder: Path, index: int) -> Path:
+    return folder / f"chunk-{index:04d}.safetensors"
+
+
+def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
+    """Store a chunk; False where the disk would not take it."""
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(getattr(chunk, name))) for name in _ARRAYS}
+    bodies = chunk.state.bodies
+    tensors |= {f"state.{f.name}": torch.from_numpy(np.ascontiguousarray(getattr(bodies, f.name))) for f in fields(Bodies)}
+    plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born, "carry": chunk.state.carry.hex()}
+    try:
+        save_tensors(_path(folder, index), tensors, {**plain, "content": content_key(tensors, plain)})
+    except OSError:
+        return False
+    return True
+
+
+def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | None:
+    """A stored chunk; None where there is none, or where what is there is damaged or of other frames."""
+    stored = load_tensors(_path(folder, index))
+    if stored is None:
+        return None
+    tensors, about = stored
+    content = about.pop("content", None)
+    if content != content_key(tensors, about) or (about.get("start"), about.get("frames")) != (start, frames):
+        return None
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+    bodies = Bodies(*(arrays.pop(f"state.{f.name}") for f in fields(Bodies)))
+    state = State(bodies, about["born"], float.fromhex(about["carry"]))
+    return Chunk(start=start, frames=frames, state=state, **arrays)
+
+
+_LYING = {"positions": (3,), "quats": (4,), "extents": ()}
+
+
+def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) -> ParticleHistory:
+    """One history from all chunks of a run; `about` gains the counts of how particles ended."""
+
+    def joined(name: str) -> ndarray:
+        return np.concatenate([getattr(chunk, name) for chunk in chunks])
+
+    births, count = joined("births"), chunks[-1].state.born
+    ends = np.full(count, clock.frames, np.int32)
+    ended, how = joined("ended_ids"), joined("ended_how")
+    ends[ended] = joined("ended_frames")
+    offsets = np.concatenate([[0], np.cumsum(ends.astype(np.int64) - births)])
+    ids = joined("row_ids")
+    positions = np.full((offsets[-1], 3), np.nan, np.float32)
+    positions[offsets[ids] + joined("row_frames") - births[ids]] = joined("row_positions")
+    rests, collided = joined("rest_ids"), np.zeros(count, bool)
+    collided[rests] = True
+    lying = {f"rest_{name}": np.zeros((count, *shape), np.float32) for name, shape in _LYING.items()}
+    lying["rest_quats"][:, 0] = 1.0
+    for name, value in lying.items():
+        value[rests] = joined(name)
+    arrays = {
+        "births": births,
+        "ends": ends,
+        "collided": collided,
+        "offsets": offsets,
+        "positions": positions,
+        **lying,
+        "quats": joined("quats"),
+        "diameters": joined("diameters"),
+        "represents": joined("represents"),
+    }
+    counts = {name: int((how == code).sum()) for name, code in (("landed", LANDED), ("slid", SLID), ("left", LEFT))}
+    counts |= {"emitted": count, "in_air": len(chunks[-1].state.bodies)}
+    tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
+    return ParticleHistory(**tensors, fps=clock.fps, frames=clock.frames, about={**about, **counts})

@@ -1,0 +1,97 @@
+"""Free flight: the exact step, its order in changing wind, and the kernel against its plain form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pgsd_nerfstudio.physics.airborne import _SINE, GRAVITY, Flutter, advance
+from pgsd_nerfstudio.physics.wind import WindField
+from pgsd_nerfstudio.weather.effect import Wind
+
+WIND = WindField.draw(Wind(), 3)
+TOLERANCE = {np.float32: 2e-5, np.float64: 1e-12}
+
+
+def particles(count: int, dtype: type) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(5)
+    position = rng.uniform([-3, -3, 1], [3, 3, 7], (count, 3))
+    return position.astype(dtype), rng.normal(size=(count, 3)).astype(dtype), rng.uniform(0.6, 1.4, count).astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("step", [0.01, 0.04, 1.0])
+def test_fall_in_still_air_is_the_analytic_one(dtype, step):
+    position, velocity, speed = particles(50, dtype)
+    x0, v0 = position.astype(np.float64), velocity.astype(np.float64)
+    steps = 4
+    for k in range(steps):
+        advance(position, velocity, speed, Flutter.none(50, dtype), WIND.still(), k * step, step)
+    t, tau = steps * step, speed.astype(np.float64)[:, None] / GRAVITY
+    settled = np.stack([0 * speed, 0 * speed, -speed], 1).astype(np.float64)
+    decay = np.exp(-t / tau)
+    assert np.abs(velocity - (settled + (v0 - settled) * decay)).max() < TOLERANCE[dtype]
+    assert np.abs(position - (x0 + settled * t + (v0 - settled) * tau * (1 - decay))).max() < TOLERANCE[dtype]
+
+
+def test_two_half_steps_equal_one_step_in_still_air():
+    one, velocity, speed = particles(20, np.float64)
+    two, velocity_two = one.copy(), velocity.copy()
+    advance(one, velocity, speed, Flutter.none(20, np.float64), WIND.still(), 0.0, 0.08)
+    for k in range(2):
+        advance(two, velocity_two, speed, Flutter.none(20, np.float64), WIND.still(), k * 0.04, 0.04)
+    np.testing.assert_allclose(two, one, atol=1e-13)
+    np.testing.assert_allclose(velocity_two, velocity, atol=1e-13)
+
+
+def test_a_flake_without_wind_reaches_terminal_speed():
+    position, velocity, speed = particles(20, np.float32)
+    for k in range(50):
+        advance(position, velocity, speed, Flutter.none(20), WIND.still(), k * 0.04, 0.04)
+    np.testing.assert_allclose(velocity, np.stack([0 * speed, 0 * speed, -speed], 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 3e-7), (np.float32, 3e-5)])
+def test_the_kernel_feels_the_wind_of_the_plain_form(dtype, tolerance):
+    """A weightless particle takes on the wind at the middle of the step."""
+    position, _, _ = particles(200, dtype)
+    position[:50, 2] -= 4  # some near and below the ground
+    velocity, at = np.zeros_like(position), position.astype(np.float64)
+    advance(position, velocity, np.full(200, 1e-9, dtype), Flutter.none(200, dtype), WIND, 1.5, 0.04)
+    np.testing.assert_allclose(velocity, WIND.velocity(at, 1.52), atol=tolerance)
+
+
+def test_flutter_is_a_sideways_circle_of_the_given_speed():
+    position, velocity, speed = particles(8, np.float64)
+    flutter = Flutter(np.full(8, 0.2), np.full(8, 1.5), np.linspace(0, 1, 8))
+    track = []
+    for k in range(400):
+        advance(position, velocity, speed, flutter, WIND.still(), k * 0.01, 0.01)
+        track.append(velocity.copy())
+    sideways = np.linalg.norm(np.array(track)[200:, :, :2], axis=2)
+    lag = 1 / np.sqrt(1 + (2 * math.pi * 1.5 * speed / GRAVITY) ** 2)  # of a first-order follower
+    np.testing.assert_allclose(sideways, 0.2 * np.broadcast_to(lag, sideways.shape), rtol=0.01)
+    np.testing.assert_allclose(np.array(track)[200:, :, 2], np.broadcast_to(-speed, sideways.shape), atol=1e-6)
+
+
+def test_the_step_is_second_order_in_changing_wind():
+    def end(step: float) -> np.ndarray:
+        position, velocity, speed = particles(100, np.float64)
+        velocity[:] = WIND.velocity(position, 0.0) - np.stack([0 * speed, 0 * speed, speed], 1)
+        for k in range(round(0.64 / step)):
+            advance(position, velocity, speed, Flutter.none(100, np.float64), WIND, k * step, step)
+        return position
+
+    truth = end(0.000625)
+    errors = [float(np.abs(end(step) - truth).mean()) for step in (0.04, 0.02, 0.01)]
+    assert errors[0] < 5e-4  # half a millimetre after 0.64 s
+    assert errors[0] / errors[1] > 3.2
+    assert errors[1] / errors[2] > 3.2
+
+
+def test_the_polynomial_is_the_sine():
+    r = np.linspace(-0.25, 0.25, 10_001)
+    poly = r * np.polyval(_SINE[::-1], r * r)
+    assert np.abs(poly - np.sin(2 * math.pi * r)).max() < 4e-9

@@ -1,0 +1,101 @@
+"""Ragged trajectories: who is where when, and files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from pgsd_nerfstudio.physics.history import ParticleHistory
+
+
+@pytest.fixture
+def history() -> ParticleHistory:
+    """Three particles over 6 frames: one lands in frame 2, one flies on from frame 3, one is there in frame 1 only."""
+    births, ends = torch.tensor([0, 3, 1]), torch.tensor([3, 6, 2])
+    offsets = torch.tensor([0, 3, 6, 7])
+    positions = torch.tensor([0.0, 1, 3, 10, 12, 16, 50])[:, None] * torch.tensor([1.0, 0, -1])
+    return ParticleHistory(
+        births=births.int(),
+        ends=ends.int(),
+        collided=torch.tensor([True, False, False]),
+        offsets=offsets,
+        positions=positions,
+        rest_positions=torch.tensor([[3.0, 0, -3], [0, 0, 0], [0, 0, 0]]),
+        rest_quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
+        rest_extents=torch.tensor([0.1, 0, 0]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
+        diameters=torch.full((3,), 0.005),
+        represents=torch.ones(3),
+        fps=25.0,
+        frames=6,
+        about={"effect": "test", "seed": 3},
+    )
+
+
+def test_a_particle_is_active_from_birth_through_its_hit(history):
+    assert [history.active(f).tolist() for f in range(6)] == [[0], [0, 2], [0], [1], [1], [1]]
+
+
+def test_it_rests_from_the_frame_after_the_hit(history):
+    assert [history.resting(f).tolist() for f in range(6)] == [[], [], [], [0], [0], [0]]
+
+
+def test_positions_belong_to_their_frames(history):
+    assert history.positions_at(2, torch.tensor([0]))[0, 0] == 3
+    assert history.positions_at(4, torch.tensor([1]))[0, 0] == 12
+    assert history.positions_at(1, torch.tensor([0, 2]))[:, 0].tolist() == [1, 50]
+
+
+def test_displacement_is_to_the_frame_before(history):
+    assert history.displacement_at(2, torch.tensor([0]))[0].tolist() == [2, 0, -2]
+    assert history.displacement_at(5, torch.tensor([1]))[0].tolist() == [4, 0, -4]
+
+
+def test_displacement_in_the_first_frame_is_the_first_step(history):
+    assert history.displacement_at(3, torch.tensor([1]))[0, 0] == 2
+    assert history.displacement_at(0, torch.tensor([0]))[0, 0] == 1
+
+
+def test_displacement_is_zero_for_a_single_frame(history):
+    assert history.displacement_at(1, torch.tensor([2]))[0].tolist() == [0, 0, 0]
+
+
+def test_a_window_is_dense(history):
+    window = history.window(2, 5)
+    assert window.ids.tolist() == [0, 1]
+    assert window.active.tolist() == [[True, False, False], [False, True, True]]
+    assert window.positions[:, :, 0].tolist() == [[3, 3, 3], [10, 10, 12]]
+
+
+def test_saved_and_loaded_it_is_the_same(history, tmp_path):
+    history.save(tmp_path / "h.safetensors")
+    again = ParticleHistory.load(tmp_path / "h.safetensors")
+    assert again is not None
+    assert (again.fps, again.frames, dict(again.about)) == (25.0, 6, {"effect": "test", "seed": 3})
+    for name, value in vars(history).items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, getattr(again, name)), name
+            assert value.dtype == getattr(again, name).dtype
+
+
+def test_a_damaged_file_is_no_history(history, tmp_path):
+    path: Path = tmp_path / "h.safetensors"
+    history.save(path)
+    path.write_bytes(path.read_bytes()[:-20])
+    assert ParticleHistory.load(path) is None
+    assert ParticleHistory.load(tmp_path / "none.safetensors") is None
+
+
+def test_nan_is_reported_with_its_frame(history):
+    positions = history.positions.clone()
+    positions[4, 1] = torch.nan
+    with pytest.raises(ValueError, match="positions of particle 1 are not finite in frame 4"):
+        replace(history, positions=positions).check_finite()
+
+
+def test_offsets_must_cover_the_positions(history):
+    with pytest.raises(ValueError, match="offsets must have 4 entries and end at 6"):
+        replace(history, positions=history.positions[:-1])
