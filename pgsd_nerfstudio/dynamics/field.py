@@ -1,0 +1,146 @@
+"""The neural dynamics field: small corrections to the simulated motion, and changes of appearance, per particle and frame.
+
+Architecture of the paper's supplement, "Implementation Details": one network per physical state, each a backbone of two hidden
+layers of 128 with ReLU and one linear head per quantity. The heads start at zero, so that an untrained field changes nothing,
+and every output is bounded by construction (bound x tanh), so that no weights can make a roll-out explode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
+from pgsd_nerfstudio.dynamics.look import Change
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.weather.appearance import ParticleLook
+
+HIDDEN = 128
+APPEARANCE = 7  # opacity 1, scale 3, colour 3
+REFERENCE_SCALE = 0.01  # m; scales enter as the logarithm of their ratio to it, since metres of a flake are all but zero
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeltaBounds:
+    """Largest change of one particle from one frame to the next."""
+
+    velocity: float = 0.02
+    """Velocity correction per axis in metres per frame; at 25 fps 0.5 m/s, half the fall speed of a flake."""
+    rotation: float = 0.2
+    """Angular velocity per axis in radians per frame; at 25 fps 0.8 turns per second."""
+    opacity: float = 0.05
+    """Change of opacity per frame: within a second at 25 fps it can go from one end to the other."""
+    log_scale: float = 0.05
+    """Change of the logarithm of the scales per frame."""
+    rgb: float = 0.05
+    """Change of colour per frame."""
+
+
+class ActiveDelta(NamedTuple):
+    """What the field adds to n particles in the air in one frame."""
+
+    velocity: Float[Tensor, "n 3"]
+    """Metres per frame."""
+    rotation: Float[Tensor, "n 3"]
+    """Rotation vector in the particle's own axes, radians per frame."""
+    change: Change
+
+
+class StateNet(nn.Module):
+    """The network of one physical state."""
+
+    def __init__(self, heads: dict[str, int]) -> None:
+        super().__init__()
+        self.first = nn.Linear(3 * WIDTH + APPEARANCE, HIDDEN)
+        self.second = nn.Linear(HIDDEN, HIDDEN)
+        self.heads = nn.ModuleDict({name: nn.Linear(HIDDEN, width) for name, width in heads.items()})
+        for head in self.heads.parameters():
+            nn.init.zeros_(head)
+
+    def forward(self, own: Float[Tensor, "n k"], shared: Float[Tensor, "1 m"]) -> dict[str, Tensor]:
+        """Heads in -1..1. The inputs are `own` of each particle followed by those that all `shared`, which cost one row."""
+        k = own.shape[1]
+        constant = linear(shared, self.first.weight[:, k:], self.first.bias)
+        hidden = torch.relu(self.second(torch.relu(linear(own, self.first.weight[:, :k]) + constant)))
+        return {name: torch.tanh(head(hidden)) for name, head in self.heads.items()}
+
+
+class DynamicsField(nn.Module):
+    """Separate networks for particles in the air and particles that have landed."""
+
+    box: Tensor
+    speed: Tensor
+
+    def __init__(
+        self,
+        box: Float[Tensor, "2 3"],  # corners of the domain, metres
+        speed: float,  # m per frame, of the fastest particle
+        frames: int,
+        bounds: DeltaBounds | None = None,
+    ) -> None:
+        super().__init__()
+        self.frames, self.bounds = frames, bounds or DeltaBounds()
+        self.register_buffer("box", box.detach().clone().float())
+        self.register_buffer("speed", torch.tensor(max(float(speed), 1e-6)))
+        appearance = {"opacity": 1, "scale": 3, "rgb": 3}
+        self.active_net = StateNet({"velocity": 3, "rotation": 3, **appearance})
+        self.collided_net = StateNet(appearance)
+
+    @staticmethod
+    def for_history(history: ParticleHistory, bounds: DeltaBounds | None = None) -> DynamicsField:
+        """A field for these particles: domain box and fastest speed come from their trajectories."""
+        if history.positions.shape[0] == 0:
+            return DynamicsField(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, history.frames, bounds)
+        low, high = history.positions.aminmax(dim=0)
+        steps = (history.positions[1:] - history.positions[:-1]).norm(dim=1)
+        same = torch.ones_like(steps, dtype=torch.bool)
+        between = history.offsets[1:-1]  # rows where the next particle starts; a particle without rows repeats its neighbour's
+        same[between[(between > 0) & (between <= steps.shape[0])] - 1] = False
+        speed = float(steps[same].max()) if bool(same.any()) else 0.0
+        return DynamicsField(torch.stack([low, high]), speed, history.frames, bounds).to(history.device)
+
+    def still(self) -> bool:
+        """Whether the field changes nothing at all: every head is zero, as before training."""
+        nets = (self.active_net, self.collided_net)
+        return not any(bool(parameter.any()) for net in nets for parameter in net.heads.parameters())
+
+    def active(
+        self,
+        position: Float[Tensor, "n 3"],  # m, of the previous frame, as rendered
+        velocity: Float[Tensor, "n 3"],  # m per frame, simulated, from the previous frame to this one
+        frame: int,
+        look: ParticleLook,  # of the previous frame
+    ) -> ActiveDelta:
+        """Corrections for particles in the air."""
+        own = torch.cat([self._place(position), _appearance(look), fourier((velocity / self.speed).clamp(-1, 1))], dim=1)
+        out = self.active_net(own, self._time(frame))
+        bounds = self.bounds
+        return ActiveDelta(bounds.velocity * out["velocity"], bounds.rotation * out["rotation"], self._change(out))
+
+    def collided(self, position: Float[Tensor, "n 3"], frame: int, look: ParticleLook) -> Change:
+        """Changes for particles at rest; their motion is fixed, their velocity enters as zero."""
+        own = torch.cat([self._place(position), _appearance(look)], dim=1)
+        shared = torch.cat([fourier(position.new_zeros(1, 3)), self._time(frame)], dim=1)
+        return self._change(self.collided_net(own, shared))
+
+    def _place(self, position: Tensor) -> Float[Tensor, "n 24"]:
+        low, high = self.box
+        return fourier((2 * (position - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1))
+
+    def _time(self, frame: int) -> Float[Tensor, "1 24"]:
+        return sinusoidal(frame / self.frames, self.box)
+
+    def _change(self, out: dict[str, Tensor]) -> Change:
+        bounds = self.bounds
+        return Change(bounds.opacity * out["opacity"][:, 0], bounds.log_scale * out["scale"], bounds.rgb * out["rgb"])
+
+
+def _appearance(look: ParticleLook) -> Float[Tensor, "n 7"]:
+    scales = look.scales.clamp_min(1e-6).log() - math.log(REFERENCE_SCALE)
+    return torch.cat([look.opacity[:, None], scales, look.rgb], dim=1)

@@ -1,0 +1,106 @@
+"""Appearance that changes: what is added to the initial look of a particle, and the one shift that all particles share.
+
+Opacity changes linearly within 0..1, scale as a factor (its logarithm adds up) within 1/8..8 of the initial one, colour
+linearly within 0..1. A change of zero leaves every bit of the initial look as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
+
+LOG_SCALE_BOUND = math.log(8.0)
+LOGIT_BOUND = 6.0
+
+
+class Change(NamedTuple):
+    """What is added to the appearance of n particles."""
+
+    opacity: Float[Tensor, "n"]
+    log_scale: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]
+
+    @staticmethod
+    def none(count: int, like: Tensor) -> Change:
+        """No change of `count` particles; device and dtype of `like`."""
+        return Change(like.new_zeros(count), like.new_zeros(count, 3), like.new_zeros(count, 3))
+
+    def times(self, factor: Float[Tensor, "n"]) -> Change:
+        return Change(self.opacity * factor, self.log_scale * factor[:, None], self.rgb * factor[:, None])
+
+
+def changed(look: ParticleLook, change: Change) -> ParticleLook:
+    """The look with the change applied."""
+    return ParticleLook(look.opacity + change.opacity, look.scales * change.log_scale.exp(), look.rgb + change.rgb)
+
+
+def accumulate(look: ParticleLook, change: Change, delta: Change) -> Change:
+    """`change` + `delta`, kept where the look it applies to stays within its bounds."""
+    return Change(
+        clamp(change.opacity + delta.opacity, -look.opacity, 1 - look.opacity),
+        clamp(change.log_scale + delta.log_scale, -LOG_SCALE_BOUND, LOG_SCALE_BOUND),
+        clamp(change.rgb + delta.rgb, -look.rgb, 1 - look.rgb),
+    )
+
+
+class LearnedLook(nn.Module):
+    """One shift of the look for all particles in the air and one for all that have landed: 2 x (opacity 1, scale 3, colour 3).
+
+    The paper says that the initial appearance itself is optimized; a shift that all share moves it coherently and with few
+    numbers, while the field adds what differs by place and time. Zero, its start, is the initial look bit for bit.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.active = nn.Parameter(torch.zeros(7))
+        """Logit of the opacity, logarithm of the three scales, colour."""
+        self.collided = nn.Parameter(torch.zeros(7))
+
+    def forward(self, look: InitialLook) -> InitialLook:
+        """The initial look, shifted."""
+        return InitialLook(_shifted(look.active, self.active), _shifted(look.collided, self.collided), look.settle_seconds)
+
+    def bounded(self) -> tuple[Change, Change]:
+        """The shifts in use (active, collided), each as a Change of one particle whose opacity is a logit."""
+        return _bounded(self.active), _bounded(self.collided)
+
+
+def _bounded(raw: Float[Tensor, "7"]) -> Change:
+    return Change(
+        LOGIT_BOUND * torch.tanh(raw[:1] / LOGIT_BOUND),
+        LOG_SCALE_BOUND * torch.tanh(raw[None, 1:4] / LOG_SCALE_BOUND),
+        torch.tanh(raw[None, 4:]),
+    )
+
+
+def _shifted(look: ParticleLook, raw: Float[Tensor, "7"]) -> ParticleLook:
+    shift = _bounded(raw.to(look.opacity))
+    # sigmoid(logit(o) + x) without logarithms: exact where x = 0, and where o is 0 or 1.
+    odds = shift.opacity.exp()
+    opacity = look.opacity * odds / (1 + look.opacity * (odds - 1))
+    return ParticleLook(opacity, look.scales * shift.log_scale.exp(), clamp(look.rgb + shift.rgb, 0.0, 1.0))
+
+
+def clamp(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
+    """Clamp whose gradient vanishes only for a descent that would lead further out: what has saturated can come back."""
+    return _Clamp.apply(x, low, high)  # type: ignore[return-value]
+
+
+class _Clamp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
+        ctx.save_for_backward(x < low, x > high)
+        low, high = torch.as_tensor(low).to(x), torch.as_tensor(high).to(x)
+        return torch.minimum(torch.maximum(x, low), high)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        below, above = ctx.saved_tensors
+        outward = (below & (gradient > 0)) | (above & (gradient < 0))
+        return gradient.masked_fill(outward, 0.0), None, None

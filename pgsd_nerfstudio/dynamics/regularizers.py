@@ -1,0 +1,111 @@
+"""What keeps the learned motion near the simulated one and the appearance calm; paper, eq. physics_guidance and app_reg.
+
+Every term is an L2 norm per Gaussian (not its square), averaged over the Gaussians and the frames of the clip. The norms are
+sqrt(x^2 + eps^2) - eps with eps = 1e-6: the same for all that matters, zero at zero, and with a finite gradient there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics.look import Change, LearnedLook
+from pgsd_nerfstudio.dynamics.rollout import RolledFrame
+
+EPSILON = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegularizationWeights:
+    """Weights of the terms, from the paper's supplement; in adaptive weighting all are multiplied by |L_SDS|."""
+
+    xyz: float = 0.1
+    """Distance to the simulated position, per metre."""
+    vel: float = 0.1
+    """Velocity correction, per metre per frame."""
+    rot: float = 0.1
+    """Angle to the initial orientation, per radian."""
+    active_opacity: float = 1.0
+    """Change of opacity per frame, in the air."""
+    active_scale: float = 1.0
+    """Change of the logarithm of the scales per frame, in the air."""
+    active_rgb: float = 35.0
+    """Change of colour per frame, in the air."""
+    collided_opacity: float = 35.0
+    """Change of opacity per frame, after landing."""
+    collided_scale: float = 35.0
+    """Change of the logarithm of the scales per frame, after landing."""
+    collided_rgb: float = 35.0
+    """Change of colour per frame, after landing."""
+    look: float = 0.01
+    """Shift of the look that all particles share; not in the paper, which regularizes changes from frame to frame only."""
+
+    def total(self, terms: Mapping[str, Tensor], scale: float = 1.0) -> Tensor:
+        """Weighted sum of `terms`, times `scale`."""
+        return scale * torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
+
+
+def regularization(clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None) -> dict[str, Tensor]:
+    """The terms of one clip, named as in RegularizationWeights; zero where there is no particle."""
+    stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
+    zero = clip[0].gaussians.means.new_zeros(())
+    mean = _Mean(zero)
+    terms = {
+        "xyz": mean(safe_norm(rolled.offset) for rolled in clip),
+        "vel": mean(safe_norm(deltas.active.velocity) for deltas in stepped),
+        "rot": mean(rotation_angle(rolled.quats, rolled.simulated_quats) for rolled in clip),
+        **_appearance("active", [deltas.active.change for deltas in stepped], mean),
+        **_appearance("collided", [deltas.resting for deltas in stepped], mean),
+    }
+    if learned_look is not None:
+        shifts = learned_look.bounded()
+        terms["look"] = torch.stack([_size(shift).sum() for shift in shifts]).sum()
+    return terms
+
+
+def safe_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
+    """L2 norm per row; its gradient is finite everywhere and zero at zero."""
+    return (x.square().sum(dim=1) + EPSILON**2).sqrt() - EPSILON
+
+
+def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+    """Angle in radians, 0..pi, between two orientations given as wxyz quaternions: 2 arccos |a . b|.
+
+    Computed as 2 atan2 of the sine and cosine of the half angle: the arccos has an infinite gradient at equal orientations.
+    """
+    between = roma.quat_product(roma.quat_conjugation(roma.quat_wxyz_to_xyzw(b)), roma.quat_wxyz_to_xyzw(a))
+    return 2 * torch.atan2(safe_norm(between[:, :3]), between[:, 3].abs())
+
+
+def drift(frames: Iterable[RolledFrame]) -> float:
+    """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
+    means = [float(rolled.offset.norm(dim=1).mean()) for rolled in frames if len(rolled.active)]
+    return sum(means) / len(means) if means else 0.0
+
+
+def _appearance(state: str, changes: Sequence[Change], mean: _Mean) -> dict[str, Tensor]:
+    return {
+        f"{state}_opacity": mean(safe_norm(change.opacity[:, None]) for change in changes),
+        f"{state}_scale": mean(safe_norm(change.log_scale) for change in changes),
+        f"{state}_rgb": mean(safe_norm(change.rgb) for change in changes),
+    }
+
+
+def _size(shift: Change) -> Float[Tensor, "1"]:
+    return safe_norm(shift.opacity[:, None]) + safe_norm(shift.log_scale) + safe_norm(shift.rgb)
+
+
+class _Mean:
+    """Mean over all rows of several frames; zero (and no NaN) where there are none."""
+
+    def __init__(self, zero: Tensor) -> None:
+        self._zero = zero
+
+    def __call__(self, rows: Iterable[Float[Tensor, "n"]]) -> Tensor:
+        every = torch.cat([self._zero[None], *rows])
+        return every.sum() / max(len(every) - 1, 1)

@@ -1,0 +1,208 @@
+"""The roll-out: from simulated motion, initial look and learned field to the Gaussians of any frame.
+
+Training windows start from states that the roll-out really reaches. (The paper's code restarts every training clip from
+simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) Rolling 250 frames for
+one clip would be waste, so `refresh` does it once in a while and keeps a state every `stride` frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics.field import DynamicsField
+from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
+from pgsd_nerfstudio.dynamics.state import Deltas, State, advance, fading, simulated
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class RolledFrame:
+    """One frame of a roll-out: what to render, and what to regularize."""
+
+    frame: int
+    gaussians: Gaussians
+    """In metres, plain RGB: the active ones, then the collided ones."""
+    active: Int[Tensor, "n"]
+    """Ids of the first n Gaussians."""
+    resting: Int[Tensor, "m"]
+    """Ids of the other m."""
+    offset: Float[Tensor, "n 3"]
+    """Rendered minus simulated position, metres."""
+    quats: Float[Tensor, "n 4"]
+    """Rendered orientation, wxyz."""
+    simulated_quats: Float[Tensor, "n 4"]
+    deltas: Deltas | None
+    """What the field added in this frame; None in a roll-out without gradient."""
+
+
+class Rollout:
+    """Particles over time, at random access and in windows with gradient. Everything is in metres."""
+
+    def __init__(
+        self,
+        history: ParticleHistory,
+        look: InitialLook,
+        field: DynamicsField,
+        learned_look: LearnedLook | None = None,
+        *,
+        stride: int = 25,
+    ) -> None:
+        """`stride` frames lie between kept states; all parts must be on one device."""
+        if stride < 1:
+            raise ValueError(f"stride must be at least one frame, got {stride}")
+        self.history, self.look, self.field, self.learned_look, self.stride = history, look, field, learned_look, stride
+        self._keyframes: dict[int, State] = {}
+        self._stamp: tuple[int, ...] = ()
+        self._last: State | None = None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.history.frames
+
+    @property
+    def stale(self) -> bool:
+        """Whether weights have changed since `refresh`: then frames come from states that older weights reached."""
+        return self._stamp != self._weights()
+
+    @torch.no_grad()
+    def refresh(self, progress: Progress | None = None) -> None:
+        """Roll through the whole sequence with the present weights and keep a state every `stride` frames.
+
+        Costs nothing before the field has learned anything. `progress` is told (frames done, of how many).
+        """
+        weights, keyframes = self._weights(), {}
+        if not self.field.still():
+            look, state = self._learned(), simulated(self.history, 0)
+            keyframes[0], last = state, (len(self) - 1) // self.stride * self.stride
+            for frame in range(1, last + 1):
+                state, _ = advance(state, self.history, look, self.field)
+                if frame % self.stride == 0:
+                    keyframes[frame] = state
+                if progress:
+                    progress(frame, last)
+        self._keyframes, self._stamp, self._last = keyframes, weights, None
+
+    @torch.no_grad()
+    def gaussians(self, frame: int, visible: Bool[Tensor, "p"] | None = None) -> Gaussians:
+        """The Gaussians of any frame, without gradient; neighbouring frames in ascending order are cheapest.
+
+        Rolls from the kept state before `frame` (made by a first `refresh` if there is none yet, see `stale`).
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        return self._rendered(self._reach(frame, visible), self._learned(), None).gaussians
+
+    @torch.no_grad()
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolledFrame]:
+        """Frames start .. stop (exclusive) one after the other, without gradient; for rendering and measuring."""
+        look = self._learned()
+        for frame in range(start, len(self) if stop is None else stop):
+            yield self._rendered(self._reach(frame, None), look, None)
+
+    def window(
+        self,
+        start: int,
+        frames: int,
+        *,
+        visible: Bool[Tensor, "p"] | None = None,
+        begin: Literal["rollout", "simulation"] = "rollout",
+        detach: bool = False,
+    ) -> list[RolledFrame]:
+        """A clip with gradient to field and learned look: true recurrence from its first frame to its last.
+
+        Args:
+            start: first frame of the clip.
+            frames: length of the clip.
+            visible: mask over all particles; only these are evaluated. None means all.
+            begin: where the clip starts from: the state that the roll-out reaches at the frame before, or (the paper's code)
+                the simulated one.
+            detach: cut the gradient between frames, as the paper's code does.
+
+        Raises:
+            IndexError: the clip leaves the sequence.
+            FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
+        """
+        if frames < 1 or not 0 <= start <= len(self) - frames:
+            raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {len(self)} frames")
+        with torch.no_grad():
+            before = max(start - 1, 0)
+            reached = begin == "rollout" and start > 0
+            state = self._reach(before, visible) if reached else simulated(self.history, before, visible)
+        look = self._learned()
+        clip = [self._rendered(state, look, None)] if start == 0 else []
+        while len(clip) < frames:
+            state, deltas = advance(state.detach() if detach else state, self.history, look, self.field, visible)
+            clip.append(self._rendered(state, look, deltas))
+        for rolled in clip:
+            _check_finite(rolled)
+        return clip
+
+    def _learned(self) -> InitialLook:
+        if self.learned_look is None:
+            return self.look
+        if not torch.is_grad_enabled() and not any(bool(p.any()) for p in self.learned_look.parameters()):
+            return self.look
+        return self.learned_look(self.look)
+
+    def _weights(self) -> tuple[int, ...]:
+        """Changes with every in-place update of a weight, also by an optimizer or by loading a state dict."""
+        modules = [self.field, *([self.learned_look] if self.learned_look else [])]
+        return tuple(number for module in modules for p in module.parameters() for number in (id(p), p._version))
+
+    def _reach(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
+        """The state at a frame, without gradient."""
+        if not 0 <= frame < len(self):
+            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
+        if self.field.still():
+            return simulated(self.history, frame, visible)
+        if not self._keyframes:
+            self.refresh()
+        state = self._keyframes[frame // self.stride * self.stride]
+        last = self._last
+        if visible is None and last is not None and not self.stale and state.frame <= last.frame <= frame:
+            state = last
+        state, look = state.select(visible), self._learned()
+        while state.frame < frame:
+            state, _ = advance(state, self.history, look, self.field, visible)
+        if visible is None:
+            self._last = state
+        return state
+
+    def _rendered(self, state: State, look: InitialLook, deltas: Deltas | None) -> RolledFrame:
+        history = self.history
+        fade = fading(history, state.frame, state.active)
+        offset = state.offset * fade[:, None]
+        flying = changed(look.active.select(state.active), state.active_change.times(fade))
+        lying = changed(look.collided_at(history, state.frame, state.resting), state.resting_change)
+        looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(flying), _fields(lying), strict=True)))
+        gaussians = Gaussians(
+            torch.cat([history.positions_at(state.frame, state.active) + offset, history.rest_positions[state.resting]]),
+            torch.cat([state.quats, history.rest_quats[state.resting]]),
+            looks.scales,
+            looks.opacity,
+            looks.rgb,
+        )
+        simulated_quats = history.quats[state.active]
+        return RolledFrame(state.frame, gaussians, state.active, state.resting, offset, state.quats, simulated_quats, deltas)
+
+
+def _fields(look: ParticleLook) -> tuple[Tensor, Tensor, Tensor]:
+    return look.opacity, look.scales, look.rgb
+
+
+def _check_finite(rolled: RolledFrame) -> None:
+    try:
+        rolled.gaussians.check_finite()
+    except ValueError as error:
+        raise FloatingPointError(f"frame {rolled.frame} of the roll-out: {error}") from error

@@ -1,0 +1,158 @@
+"""What the recurrence carries from frame to frame, and one step of it.
+
+The paper's x(t) = x(t-1) + v_sim(t) + dv is carried as the learned offset alone, d(t) = d(t-1) + dv with x = x_sim + d: the
+same sum, but a field that adds nothing reproduces the simulation bit for bit, however many frames it runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import roma
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics.field import ActiveDelta, DynamicsField
+from pgsd_nerfstudio.dynamics.look import Change, accumulate, changed
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.weather.appearance import InitialLook
+
+LANDING_FRAMES = 5
+"""Over so many frames before contact everything learned in flight fades out: the particle lands where and as physics says,
+without a jump. (The paper leaves open what becomes of an offset on landing; dropping it there makes the particle jump.)"""
+
+
+@dataclass(frozen=True)
+class State:
+    """All particles at one frame."""
+
+    frame: int
+    active: Int[Tensor, "n"]
+    """Ids of the particles in the air, ascending."""
+    offset: Float[Tensor, "n 3"]
+    """Learned part of the position, metres, before it fades for landing."""
+    quats: Float[Tensor, "n 4"]
+    active_change: Change
+    resting: Int[Tensor, "m"]
+    """Ids of the particles that have landed, ascending."""
+    resting_change: Change
+
+    def select(self, visible: Bool[Tensor, "p"] | None) -> State:
+        """Only the visible ones."""
+        if visible is None:
+            return self
+        a, r = visible[self.active], visible[self.resting]
+        return State(
+            self.frame,
+            self.active[a],
+            self.offset[a],
+            self.quats[a],
+            Change(*(x[a] for x in self.active_change)),
+            self.resting[r],
+            Change(*(x[r] for x in self.resting_change)),
+        )
+
+    def detach(self) -> State:
+        """The same without its past."""
+        return replace(
+            self,
+            offset=self.offset.detach(),
+            quats=self.quats.detach(),
+            active_change=Change(*(x.detach() for x in self.active_change)),
+            resting_change=Change(*(x.detach() for x in self.resting_change)),
+        )
+
+
+class Deltas(NamedTuple):
+    """What the field added in one step: to the particles that were in the air before and still are, and to those that lay."""
+
+    active: ActiveDelta
+    resting: Change
+
+
+def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, "p"] | None = None) -> State:
+    """The state in which nothing has been learned: simulated positions, initial look."""
+    active, resting = _seen(history.active(frame), visible), _seen(history.resting(frame), visible)
+    like = history.positions
+    return State(
+        frame,
+        active,
+        like.new_zeros(len(active), 3),
+        history.quats[active],
+        Change.none(len(active), like),
+        resting,
+        Change.none(len(resting), like),
+    )
+
+
+def advance(
+    state: State,
+    history: ParticleHistory,
+    look: InitialLook,
+    field: DynamicsField,
+    visible: Bool[Tensor, "p"] | None = None,
+) -> tuple[State, Deltas]:
+    """The state one frame later.
+
+    Args:
+        state: of the visible particles; `visible` must be the mask it was selected with.
+        history: the simulated motion.
+        look: initial look of all particles.
+        field: what is learned.
+        visible: particles to follow; None means all.
+    """
+    fresh = simulated(history, state.frame + 1, visible)
+    frame, ids = fresh.frame, fresh.active
+    # Ids ascend in both states, so those who stay stand in the same order here and there.
+    stay, stayed = history.births[ids] < frame, history.ends[state.active] > frame
+    ids = ids[stay]
+    change = Change(*(x[stayed] for x in state.active_change))
+    offset, quats = state.offset[stayed], state.quats[stayed]
+    fade = fading(history, state.frame, ids)
+    before, now = history.positions_at(state.frame, ids), history.positions_at(frame, ids)
+    flying = look.active.select(ids)
+    delta = field.active(before + offset * fade[:, None], now - before, frame, changed(flying, change.times(fade)))
+
+    laid = history.ends[fresh.resting] < frame
+    rest = fresh.resting[laid]
+    lying = changed(look.collided_at(history, state.frame, rest), state.resting_change)
+    resting_delta = field.collided(history.rest_positions[rest], frame, lying)
+    resting = accumulate(look.collided_at(history, frame, rest), state.resting_change, resting_delta)
+
+    return State(
+        frame,
+        fresh.active,
+        _placed(fresh.offset, stay, offset + delta.velocity),
+        _placed(fresh.quats, stay, turned(quats, delta.rotation)),
+        _placed_change(fresh.active_change, stay, accumulate(flying, change, delta.change)),
+        fresh.resting,
+        _placed_change(fresh.resting_change, laid, resting),
+    ), Deltas(delta, resting_delta)
+
+
+def turned(quats: Float[Tensor, "n 4"], rotation: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """R o dR(omega): wxyz quaternions turned by rotation vectors in their own axes; exactly the same where those are zero."""
+    step = roma.rotvec_to_unitquat(rotation)
+    return roma.quat_xyzw_to_wxyz(roma.quat_product(roma.quat_wxyz_to_xyzw(quats), step))
+
+
+def fading(history: ParticleHistory, frame: int, ids: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Factor on what active particles have learned: 1 in free flight, falling to 0 at the frame of contact."""
+    left = (history.ends[ids] - 1 - frame).to(history.positions) / LANDING_FRAMES
+    return torch.where(history.collided[ids], left.clamp(0, 1), 1.0)
+
+
+def _seen(ids: Int[Tensor, "n"], visible: Bool[Tensor, "p"] | None) -> Int[Tensor, "k"]:
+    return ids if visible is None else ids[visible[ids]]
+
+
+def _placed(into: Tensor, where: Bool[Tensor, "n"], values: Tensor) -> Tensor:
+    if values.shape[0] == into.shape[0]:
+        return values
+    return into.index_copy(0, where.nonzero()[:, 0], values)
+
+
+def _placed_change(into: Change, where: Bool[Tensor, "n"], values: Change) -> Change:
+    return Change(*(_placed(a, where, b) for a, b in zip(into, values, strict=True)))
