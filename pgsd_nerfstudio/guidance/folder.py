@@ -1,0 +1,129 @@
+"""Where a video prior lies: a diffusers folder of a CogVideoX text-to-video model, on this disk or on the Hugging Face hub.
+
+Everything is judged before any weight is read, so that a wrong path costs one sentence and no minutes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+BUNDLED = Path(__file__).parent / "bundled"
+PARTS = {
+    "transformer": "CogVideoXTransformer3DModel",
+    "vae": "AutoencoderKLCogVideoX",
+    "scheduler": None,
+    "text_encoder": None,
+    "tokenizer": None,
+}
+"""Subfolders of such a model and the class their configuration must name."""
+CONFIGS = {"scheduler": "scheduler_config.json", "tokenizer": "tokenizer_config.json"}
+HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
+SAMPLED_BLOCKS, BLOCK_BYTES = 64, 1 << 14
+
+
+class PriorError(ValueError):
+    """The video prior cannot be used; the message says what was expected, what was found and what to do."""
+
+
+def find_prior(place: str | Path) -> Path:
+    """The folder of a video prior.
+
+    Args:
+        place: "bundled", a local folder, or the id of a model on the Hugging Face hub such as "THUDM/CogVideoX-2b".
+
+    Raises:
+        PriorError: there is no such folder or model, or it is not a complete CogVideoX text-to-video model.
+    """
+    if str(place) == "bundled":
+        if not (BUNDLED / "transformer").is_dir():
+            raise PriorError("the bundled video prior has no weights: make them with `python scripts/train_bundled_prior.py`")
+        folder = BUNDLED
+    else:
+        folder = Path(place).expanduser()
+        if not folder.exists():
+            folder = _download(str(place))
+    _judge(folder)
+    return folder
+
+
+def fingerprint(folder: Path) -> str:
+    """Identity of the files below a folder, from their names, sizes and 64 blocks of 16 KiB of each.
+
+    Enough to tell two trainings apart without reading gigabytes of a text encoder.
+    """
+    digest = hashlib.sha256()
+    for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+        size = file.stat().st_size
+        digest.update(f"{file.relative_to(folder)}:{size};".encode())
+        with file.open("rb") as stream:
+            for block in range(SAMPLED_BLOCKS):
+                stream.seek(block * max(BLOCK_BYTES, (size - BLOCK_BYTES) // (SAMPLED_BLOCKS - 1)))
+                digest.update(stream.read(BLOCK_BYTES))
+    return digest.hexdigest()[:16]
+
+
+def stored_dtype(folder: Path) -> str:
+    """Number format of the first weight stored in a component's folder, as safetensors writes it: F16, BF16, F32."""
+    from safetensors import safe_open
+
+    with safe_open(min(folder.glob("*.safetensors")), framework="pt") as stored:
+        return stored.get_slice(next(iter(stored.keys()))).get_dtype()
+
+
+def read_config(folder: Path, part: str) -> dict[str, Any]:
+    """Configuration of one component.
+
+    Raises:
+        PriorError: the file is missing or no JSON.
+    """
+    path = folder / part / CONFIGS.get(part, "config.json")
+    try:
+        return json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise PriorError(f"a CogVideoX folder has {part}/{path.name}, but {path} could not be read: {error}") from error
+
+
+def _download(name: str) -> Path:
+    missing = f"there is no local folder {name}"
+    if not HUB_ID.fullmatch(name):
+        raise PriorError(f"{missing}; give a diffusers CogVideoX folder, a hub id such as THUDM/CogVideoX-2b, or `bundled`")
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(name, allow_patterns=["*.json", "*.txt", "*.model", "*.safetensors"]))
+    except Exception as error:  # whatever the network, the hub or the disk has to say belongs in the one sentence
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise PriorError(f"{missing}, and it could not be downloaded from the Hugging Face hub: {reason[0]}") from error
+
+
+def _judge(folder: Path) -> None:
+    if not folder.is_dir():
+        raise PriorError(f"a video prior is a diffusers CogVideoX folder, but {folder} is a file")
+    missing = [part for part in PARTS if not (folder / part).is_dir()]
+    if missing:
+        raise PriorError(
+            f"{folder} is not a diffusers CogVideoX folder: it lacks {', '.join(missing)}; "
+            f"such a folder holds {', '.join(PARTS)} and is what diffusers' save_pretrained writes"
+        )
+    for part, expected in PARTS.items():
+        config = read_config(folder, part) if part != "tokenizer" else {}
+        if expected and config.get("_class_name") != expected:
+            raise PriorError(f"{folder / part} must hold a {expected}, found {config.get('_class_name')}")
+        weighted = part in ("transformer", "vae", "text_encoder")
+        if weighted and not any((folder / part).glob("*.safetensors")):
+            raise PriorError(f"{folder / part} holds no *.safetensors weights; download the model again")
+    transformer, vae = read_config(folder, "transformer"), read_config(folder, "vae")
+    if transformer.get("in_channels", 16) != vae.get("latent_channels", 16):
+        raise PriorError(
+            f"{folder} takes {transformer.get('in_channels')} channels where its VAE makes {vae.get('latent_channels')}: "
+            "an image-to-video model; use the text-to-video one"
+        )
+    prediction = read_config(folder, "scheduler").get("prediction_type")
+    if prediction != "v_prediction":
+        raise PriorError(
+            f"the scheduler in {folder} must have the prediction_type v_prediction, as CogVideoX has, found {prediction}"
+        )
