@@ -1,0 +1,97 @@
+"""One training clip: roll out, render, ask the guide, and carry its gradient back frame by frame.
+
+The gradient on the pixels comes first, from a clip rendered without a graph. Then each frame is rendered again and
+differentiated by itself, so that at no time there is a graph over all frames; what reaches the Gaussians of the roll-out goes
+on from there with nerfstudio's own backward pass, through a surrogate that has this gradient.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+
+MARGIN = 0.1  # of the image's half extent: so far outside a particle still counts as seen, since its Gaussian has a size
+
+
+class Stopwatch:
+    """Seconds by stage of one step."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.seconds: dict[str, float] = {}
+        self._wait: Callable[[], object] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._wait()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def seen_by(stage: Stage, cameras: Cameras, history: ParticleHistory, start: int) -> Bool[Tensor, "p"]:
+    """Particles that appear in at least one picture of the clip that starts at frame `start`, in the simulated motion."""
+    seen = torch.zeros(len(history), dtype=torch.bool, device=history.device)
+    stop = start + len(cameras)
+    window = history.window(start, stop)
+    inside = torch.stack([_inside(stage, cameras[k], window.positions[:, k]) for k in range(len(cameras))], dim=1)
+    seen[window.ids[(inside & window.active).any(1)]] = True
+    resting = history.resting(stop - 1)
+    at_rest = history.rest_positions[resting]
+    for k in range(len(cameras)):
+        seen[resting[_inside(stage, cameras[k], at_rest)]] = True
+    return seen
+
+
+def _inside(stage: Stage, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    viewmat, K = camera.viewmats[0].to(metres), camera.Ks[0].to(metres)
+    local = stage.scene.frame.to_scene(metres) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = local[:, 2].clamp_min(1e-6)
+    x = (K[0, 0] * local[:, 0] / depth + K[0, 2]) / camera.width
+    y = (K[1, 1] * local[:, 1] / depth + K[1, 2]) / camera.height
+    reach = 0.5 + 0.5 * MARGIN
+    return (local[:, 2] > 0) & ((x - 0.5).abs() < reach) & ((y - 0.5).abs() < reach)
+
+
+def render_clip(
+    stage: Stage, cameras: Cameras, weather: Sequence[Gaussians], background: Float[Tensor, "3"]
+) -> Float[Tensor, "t 3 h w"]:
+    """The clip in 0..1, without a graph."""
+    with torch.no_grad():
+        return stage.rasterizer.render(cameras, weather, background).rgb.permute(0, 3, 1, 2).clamp(0, 1)
+
+
+def surrogate(
+    stage: Stage,
+    cameras: Cameras,
+    weather: Sequence[Gaussians],  # one set a frame, with the graph of the roll-out
+    background: Float[Tensor, "3"],
+    gradient: Float[Tensor, "t 3 h w"],  # of the loss with respect to the clip
+) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians."""
+    total = gradient.new_zeros(())
+    squares: dict[str, float] = {f.name: 0.0 for f in fields(Gaussians)}
+    for k, rolled in enumerate(weather):
+        if len(rolled) == 0:
+            continue
+        names = [f.name for f in fields(Gaussians) if getattr(rolled, f.name).requires_grad]
+        if not names:
+            continue
+        leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
+        picture = stage.rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background).rgb[0]
+        found = torch.autograd.grad(picture, list(leaves.values()), gradient[k].permute(1, 2, 0), allow_unused=True)
+        for name, on_leaf in zip(names, found, strict=True):
+            if on_leaf is not None:
+                total = total + (getattr(rolled, name) * on_leaf).sum()
+                squares[name] += float(on_leaf.square().sum())
+    return total, {name: square**0.5 for name, square in squares.items()}

@@ -1,0 +1,106 @@
+"""`ns-train pgsd-weather`: the method's configuration and its entry point.
+
+nerfstudio writes config.yml before any of our objects exist and gives pipeline, data manager and model a configuration each, so
+the flags are copied into all three as soon as they are parsed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from pgsd_nerfstudio.plugin.environment import prepare
+from pgsd_nerfstudio.plugin.options import CUDA, WeatherOptions, check_version
+from pgsd_nerfstudio.plugin.pipeline import WeatherPipelineConfig
+from pgsd_nerfstudio.plugin.trainer import WeatherTrainer
+
+prepare()
+
+
+@dataclass
+class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
+    """Weather for a frozen scene, refined by physics-guided score distillation."""
+
+    _target: type = field(default_factory=lambda: WeatherTrainer)
+    data: Path | None = None
+    """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
+    prompt: str | None = None
+    """What the video prior is told; by default the effect's own prompt with the scene's description in it."""
+    method_name: str | None = "pgsd-weather"
+    """Method name."""
+    machine: MachineConfig = field(default_factory=lambda: MachineConfig(device_type="cuda" if CUDA else "cpu"))
+    """Machine configuration."""
+    logging: LoggingConfig = field(default_factory=lambda: LoggingConfig(steps_per_log=1))
+    """Logging configuration; every step is logged, since a step takes seconds."""
+    viewer: ViewerConfig = field(default_factory=lambda: ViewerConfig(quit_on_train_completion=True))
+    """Viewer configuration; training ends by itself also with a viewer."""
+    vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "wandb", "viewer+wandb", "comet", "viewer+comet"] = (
+        "tensorboard"
+    )
+    """Where progress goes; a viewer shares the machine with the training."""
+    steps_per_save: int = 50
+    """Steps between checkpoints."""
+    steps_per_eval_batch: int = 0
+    """Steps between measurements of the drift on a random window; 0: never."""
+    steps_per_eval_image: int = 0
+    """Steps between pictures for tensorboard; 0: never, since each needs a roll-out."""
+    steps_per_eval_all_images: int = 0
+    """Steps between pictures of all evaluation views; 0: never."""
+    max_num_iterations: tyro.conf.Suppress[int] = 0
+    mixed_precision: tyro.conf.Suppress[bool] = False
+    optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    pipeline: tyro.conf.Suppress[WeatherPipelineConfig] = field(default_factory=WeatherPipelineConfig)
+
+    def __post_init__(self) -> None:
+        """Judge the flags, make paths absolute and hand them on; the entry point's own config, without a scene, passes."""
+        if self.load_scene is tyro.MISSING:
+            return
+        if str(self.load_scene) != "demo":
+            self.load_scene = Path(self.load_scene).expanduser().resolve()
+        if self.data is not None:
+            self.data = Path(self.data).expanduser().resolve()
+        self.check()
+        if self.experiment_name is None:
+            self.experiment_name = self.load_scene.stem
+        self.max_num_iterations, self.training_seed = self.steps, self.machine.seed
+        self.optimizers = {
+            group: {
+                "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
+                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.0, max_steps=self.steps),
+            }
+            for group, rate in {"field": self.lr, "look": self.look_lr}.items()
+        }
+        self.pipeline.share(self.options())
+
+    def options(self) -> WeatherOptions:
+        """The flags of this run alone, without nerfstudio's."""
+        return WeatherOptions(**{f.name: getattr(self, f.name) for f in fields(WeatherOptions)})
+
+    def print_to_terminal(self) -> None:
+        """Not all of nerfstudio's fields: what matters is printed as a table once it is settled, the rest is in config.yml."""
+
+    def save_config(self) -> None:
+        """As nerfstudio, but the pipeline is told first where the run lies."""
+        self.pipeline.run_folder = self.get_base_dir().resolve()
+        super().save_config()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Called when a config.yml is read: other versions are refused, a run that was moved is found where it is now."""
+        check_version(state.get("version"))
+        self.__dict__.update(state)
+        if self.load_scene is not tyro.MISSING:
+            self.pipeline.run_folder = self.get_base_dir().resolve()
+
+
+pgsd_weather = MethodSpecification(
+    config=WeatherTrainerConfig(),
+    description="Weather that falls, lands and gathers in a frozen splat, refined by physics-guided score distillation.",
+)

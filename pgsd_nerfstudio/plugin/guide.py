@@ -1,0 +1,87 @@
+"""The teacher of a run: video prior, prompts and noise schedule, from a rendered clip to the gradient on its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgsd_nerfstudio.guidance.distillation import DistillationConfig, DistilledClip, distill_clip
+from pgsd_nerfstudio.guidance.folder import find_prior, read_config
+from pgsd_nerfstudio.guidance.prior import VideoPrior
+from pgsd_nerfstudio.guidance.schedules import TimestepSchedule
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+
+PAPER_FRAMES = 9
+
+
+@dataclass(frozen=True)
+class Guide:
+    """An opened video prior that has heard what is wanted."""
+
+    prior: VideoPrior
+    wanted: str
+    unwanted: str
+    embeddings: Float[Tensor, "2 l d"]
+    """Of both texts, in this order."""
+    distillation: DistillationConfig
+    timesteps: TimestepSchedule
+    steps: int
+    seed: int
+
+    @staticmethod
+    def listening(prior: VideoPrior, options: WeatherOptions, description: str) -> Guide:
+        """A guide toward the effect's prompt for a scene that is called `description`.
+
+        Raises:
+            RunError: the text encoder cannot be used.
+        """
+        effect = options.chosen_effect()
+        wanted = options.prompt or effect.prompt_for(description)
+        unwanted = effect.negative_prompt if options.negative_prompt is None else options.negative_prompt
+        try:
+            embeddings = prior.encode_prompt([wanted, unwanted])
+        except (ValueError, OSError) as error:
+            raise RunError(str(error)) from error
+        distillation = DistillationConfig(guidance_scale=options.guidance_scale)
+        return Guide(
+            prior, wanted, unwanted, embeddings, distillation, TimestepSchedule(), options.steps, options.training_seed
+        )
+
+    def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:
+        """Which way the clip should change, in training step `step`; the noise depends on the seed and the step only.
+
+        Raises:
+            RunError: the prior cannot take clips of this shape.
+            FloatingPointError: its prediction is not finite.
+        """
+        draw = torch.Generator().manual_seed(1_000_003 * self.seed + step)
+        timestep = self.timesteps.sample(step, self.steps, draw)
+        wanted, unwanted = self.embeddings[:1], self.embeddings[1:]
+        try:
+            return distill_clip(self.prior, clip, wanted, unwanted, timestep, config=self.distillation, generator=draw)
+        except ValueError as error:
+            raise RunError(str(error)) from error
+
+
+def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[VideoPrior, WeatherOptions]:
+    """The video prior of a run, and the options with the size of the training clips settled.
+
+    Raises:
+        RunError: the prior cannot be used, or the weather is shorter than a clip.
+    """
+    try:
+        native = int(read_config(find_prior(options.prior), "transformer").get("sample_frames", PAPER_FRAMES))
+        prior = VideoPrior.load(options.prior, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
+    except (ValueError, OSError) as error:
+        raise RunError(str(error)) from error
+    frames, height, width = prior.clip_shape
+    if options.frames < frames:
+        raise RunError(
+            f"the weather has {options.frames} frames ({options.seconds:g} s), a training clip {frames}: use more --seconds"
+        )
+    sizes = {"clip_height": options.clip_height or height, "clip_width": options.clip_width or width}
+    return prior, replace(options, clip_frames=frames, **sizes)

@@ -1,0 +1,180 @@
+"""The model nerfstudio sees: the frozen scene with the weather of any moment in it.
+
+Which moment: cameras with times (viewer, camera paths with render_time, spiral, dataset) show times 0..1 over the whole
+weather, the nearest frame. Cameras without (ns-render interpolate never has any): each render shows the next frame, so that a
+video of 25 frames per second plays in real time, and starts over after the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import tyro
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.models.base_model import Model
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from torch import Tensor
+from torch.nn import Parameter
+
+from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
+from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
+from pgsd_nerfstudio.plugin.splat import splat_tensors
+from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering, choose_rasterizer
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather import initial_look
+
+BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
+
+
+@dataclass
+class WeatherModelConfig(SplatfactoModelConfig):
+    """A splatfacto by type, since viewer and ns-export ask for that; none of its training is used."""
+
+    _target: type = field(default_factory=lambda: WeatherModel)
+    options: tyro.conf.Suppress[WeatherOptions] = field(default_factory=WeatherOptions.unset)
+
+
+class WeatherModel(SplatfactoModel):
+    """Frozen scene plus learned weather. Only what is learned lies in the checkpoint."""
+
+    config: WeatherModelConfig
+
+    def __init__(self, *args: Any, stage: Stage, history: ParticleHistory, exporting: bool = False, **kwargs: Any) -> None:
+        """`stage` and `history` stay outside of the module's state; `exporting`: `gauss_params` are asked for in earnest."""
+        self.stage, self.history, self.exporting = stage, history, exporting
+        super().__init__(*args, **kwargs)
+
+    def populate_modules(self) -> None:
+        Model.populate_modules(self)  # not splatfacto's, which needs CUDA and downloads weights
+        options = self.config.options
+        look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
+        self.field = DynamicsField.for_history(self.history)
+        self.look = LearnedLook().to(self.history.device)
+        self.rollout = Rollout(self.history, look, self.field, self.look)
+        self.weather = Panel(options.seconds)
+        self.background_color = torch.tensor(BACKGROUND)
+        self.crop_box: OrientedBox | None = None
+        self._untimed = 0
+        self._cropped: tuple[Any, Rasterizer] | None = None
+        self._exported: dict[str, Tensor] | None = None
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        return {"field": list(self.field.parameters()), "look": list(self.look.parameters())}
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:
+        """None of splatfacto's: nothing is split or culled."""
+        return []
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:  # type: ignore[override]
+        """Load what was learned; always strict, since a field that is half loaded looks trained and is not.
+
+        Raises:
+            RunError: the checkpoint lacks a tensor, has one too many, or one of another shape.
+        """
+        try:
+            return torch.nn.Module.load_state_dict(self, state_dict, strict=True)
+        except RuntimeError as error:
+            reasons = " ".join(line.strip() for line in str(error).splitlines()[1:])
+            raise RunError(f"the checkpoint does not fit this version of pgsd_nerfstudio, train again: {reasons}") from error
+
+    def weather_at(self, frame: int) -> Gaussians:
+        """The weather's Gaussians in scene units at a frame of its time line, learned refinements included."""
+        with torch.no_grad(), uninterrupted():
+            return self.stage.scene.frame.gaussians_to_scene(self.rollout.gaussians(frame))
+
+    def frame_at(self, time: float) -> int:
+        """The frame nearest to a time 0..1."""
+        return round(min(max(time, 0.0), 1.0) * (self.history.frames - 1))
+
+    def get_outputs_for_camera(self, camera: NerfstudioCameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """One picture: rgb [H, W, 3], depth [H, W, 1] in scene units, accumulation [H, W, 1] and background [H, W, 3].
+
+        Raises:
+            SceneError: the camera is not a perspective one.
+        """
+        views = from_nerfstudio(camera).to(self.device)
+        if camera.times is None:
+            frame = self._untimed % self.history.frames
+            self._untimed += 1
+        else:
+            frame = self.frame_at(float(camera.times.reshape(-1)[0]))
+        return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame)), obb_box))
+
+    def get_outputs(self, ray_bundle: Any) -> dict[str, Tensor]:
+        if not isinstance(ray_bundle, NerfstudioCameras):
+            raise RunError("the weather is rasterized: it has no answer for single rays")
+        return self.get_outputs_for_camera(ray_bundle)
+
+    def render(self, views: Cameras, weather: Gaussians | None, box: OrientedBox | None = None) -> Rendering:
+        """One view of the scene with some weather or none; without gradient."""
+        rasterizer = self.stage.rasterizer
+        with torch.no_grad(), uninterrupted():
+            if box is not None:
+                rasterizer = self._inside(box)
+                weather = None if weather is None else weather.select(box.within(weather.means).reshape(-1))
+            return rasterizer.render(views, weather, self.background_color.to(self.device))
+
+    def _inside(self, box: OrientedBox) -> Rasterizer:
+        """The rasterizer of the part of the frozen scene in the viewer's crop box, the last one kept."""
+        key = [tuple(t.flatten().tolist()) for t in (box.R, box.T, box.S)]
+        if self._cropped is None or self._cropped[0] != key:
+            frozen = self.stage.rasterizer.frozen
+            inside = box.within(frozen.means).reshape(-1)
+            self._cropped = (key, choose_rasterizer(frozen.select(inside), self.device))
+        return self._cropped[1]
+
+    def _outputs(self, rendering: Rendering) -> dict[str, Tensor]:
+        rgb = rendering.rgb[0].clamp(0, 1)
+        return {
+            "rgb": rgb,
+            "depth": rendering.depth[0, ..., None],
+            "accumulation": rendering.accumulation[0, ..., None],
+            "background": self.background_color.to(rgb).expand_as(rgb),
+        }
+
+    @property
+    def gauss_params(self) -> dict[str, Float[Tensor, n * k]]:  # type: ignore[override]
+        """What ns-export writes, as splatfacto's tensors: the scene with the weather of the moment `export_time`.
+
+        A viewer, which only marks the centres with a hidden cloud of points, gets the frozen scene alone.
+        """
+        if self._exported is None:
+            frame = self.frame_at(self.config.options.export_time)
+            weather = self.weather_at(frame).to("cpu") if self.exporting else Gaussians.empty()
+            self._exported = splat_tensors(self.stage.scene.gaussians, weather)
+        return self._exported
+
+    def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
+        """Losses live in the pipeline: they concern clips, not pictures."""
+        return {}
+
+    def get_metrics_dict(self, outputs: Any, batch: Any) -> dict[str, Tensor]:
+        return {}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """How much of the picture the weather changed; photographs are no truth for a scene in which it now snows."""
+        truth, rgb = batch["image"][..., :3].to(outputs["rgb"]), outputs["rgb"]
+        return {"changed_by_weather": float((rgb - truth).abs().mean())}, {"img": torch.cat([truth, rgb], dim=1)}
+
+
+def fidelity(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> dict[str, float]:
+    """PSNR in dB and SSIM of a render against a photograph."""
+    # Imported here: it takes seconds, and every ns-* command loads this module.
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+    ours, theirs = (picture.permute(2, 0, 1)[None] for picture in (rgb, truth))
+    ssim = structural_similarity_index_measure(ours, theirs, data_range=1.0)
+    return {"psnr": float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)), "ssim": float(ssim)}  # type: ignore[arg-type]

@@ -1,0 +1,167 @@
+"""What one run is: the flags of `ns-train pgsd-weather`, as a plain record that pipeline, data manager and model share.
+
+The text under each field is its --help. Defaults fit the machine at hand: on a CPU everything is small enough to end within
+minutes, with CUDA it follows the paper.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+
+from pgsd_nerfstudio import __version__
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.weather.effect import Effect
+
+CUDA = torch.cuda.is_available()
+
+
+@dataclass
+class WeatherOptions:
+    """One weather for one scene, and how it is learned."""
+
+    load_scene: Path = tyro.MISSING
+    """The frozen scene: a splatfacto run folder, its config.yml, a .ckpt, a 3DGS .ply (with --data), or the word demo."""
+    data: Path | None = None
+    """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
+    scene_description: str | None = None
+    """What the prompt calls the scene, such as "a garden with a table"; by default made from the scene's name."""
+    metres_per_unit: float | None = None
+    """Length of one scene unit in metres; by default such that the cameras were held 1.5 m above the ground."""
+    effect: str = "snowfall"
+    """Which weather."""
+    intensity: float | None = None
+    """How much falls, in mm/h of liquid water (light snow 1, heavy snow 3); by default what the effect says."""
+    seconds: float = 10.0
+    """Length of the weather in seconds."""
+    fps: float = 25.0
+    """Frames of weather per second, as in the paper's videos."""
+    max_particles: int = 200_000 if CUDA else 20_000
+    """At most this many particles are simulated, each then standing for several; bounds time and memory of every step."""
+    weather_seed: int = 0
+    """Another seed, another snowfall of the same kind. (--machine.seed varies the training only.)"""
+    prior: str = "bundled"
+    """The video prior: bundled (small, knows only clips like the demo's), a diffusers CogVideoX folder, or a hub id such as
+    THUDM/CogVideoX-2b."""
+    prompt: str | None = None
+    """What the video prior is told; by default the effect's own prompt with the scene's description in it."""
+    negative_prompt: str | None = None
+    """What the video prior is told to keep away from; by default the effect's own."""
+    steps: int = 1000 if CUDA else 60
+    """Training steps: the paper's 1000 with CUDA; on a CPU as many as pass in a few minutes with the bundled prior."""
+    guidance_scale: float = 100.0
+    """How strongly the prompt outweighs its negative, as in the paper."""
+    lr: float = 1e-4 if CUDA else 1e-3
+    """Learning rate of the field at the start, falling to zero along a cosine. The paper's 1e-4 is meant for 1000 steps; the
+    few steps of a CPU need the larger one."""
+    look_lr: float = 2e-3 if CUDA else 2e-2
+    """Learning rate of the look that all particles share, along the same cosine: 14 numbers (logits, log scales, colours), each
+    of which can move by no more than the sum of all rates."""
+    weights: Literal["adaptive", "constant"] = "adaptive"
+    """How the physics and appearance losses are weighed: times the magnitude of the video loss (the paper), or as they are."""
+    trajectory: Literal["near", "any"] = "near"
+    """Camera path of a training clip: from a random training view to one of the six nearest, or to any other, as in the paper
+    (whose straight way through a ring of views leads across its middle within a third of a second)."""
+    refresh_every: int = 25
+    """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
+    clip_frames: int | None = None
+    """Frames of a training clip; by default 9 as in the paper, or what the video prior was made for if that is less."""
+    clip_height: int | None = None
+    """Height of a training clip in pixels; by default what the video prior was made for."""
+    clip_width: int | None = None
+    """Width of a training clip in pixels; by default what the video prior was made for."""
+    export_time: float = 1.0
+    """The moment that ns-export gaussian-splat writes, from 0 (start of the weather) to 1 (its end)."""
+    training_seed: tyro.conf.Suppress[int] = 42
+    """--machine.seed, for those who do not see the machine's configuration."""
+    version: tyro.conf.Suppress[str] = __version__
+    """The version of this plugin that wrote the config."""
+
+    @staticmethod
+    def unset() -> WeatherOptions:
+        """Options without a scene: the default of nested configurations, until the trainer's hands its own on."""
+        return WeatherOptions(load_scene=Path())
+
+    @property
+    def frames(self) -> int:
+        """Frames of the whole weather."""
+        return max(2, round(self.seconds * self.fps))
+
+    def check(self) -> None:
+        """Judge what can be judged before any work.
+
+        Raises:
+            RunError: a value cannot be used; the sentence says which and why.
+        """
+        if str(self.load_scene) != "demo" and not self.load_scene.exists():
+            raise RunError(
+                f"no scene at {self.load_scene}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo"
+            )
+        if self.data is not None and not self.data.exists():
+            raise RunError(f"no data at {self.data}: expected nerfstudio's transforms.json or its folder")
+        positive = {
+            "seconds": self.seconds,
+            "fps": self.fps,
+            "max-particles": self.max_particles,
+            "steps": self.steps,
+            "refresh-every": self.refresh_every,
+        }
+        for name, value in positive.items():
+            if not value > 0:
+                raise RunError(f"--{name} must be positive, got {value}")
+        if not 0.0 <= self.export_time <= 1.0:
+            raise RunError(f"--export-time must lie in 0-1, got {self.export_time}")
+        self.chosen_effect()
+
+    def chosen_effect(self) -> Effect:
+        """The effect with the chosen intensity.
+
+        Raises:
+            RunError: there is no such effect, or the intensity is out of its range.
+        """
+        from pgsd_nerfstudio.weather import effect
+
+        try:
+            chosen = effect(self.effect)
+            if self.intensity is not None:
+                chosen = replace(chosen, emission=replace(chosen.emission, intensity=self.intensity))
+        except ValueError as error:
+            raise RunError(str(error)) from error
+        return chosen
+
+    def command(self) -> str:
+        """The ns-train command that makes this run's motion prior again."""
+        words = ["ns-train", "pgsd-weather"]
+        for name in (
+            "load_scene",
+            "data",
+            "metres_per_unit",
+            "effect",
+            "intensity",
+            "seconds",
+            "fps",
+            "max_particles",
+            "weather_seed",
+        ):
+            value = getattr(self, name)
+            if value is not None:
+                words += [f"--{name.replace('_', '-')}", str(value)]
+        return shlex.join(words)
+
+
+def check_version(found: str | None) -> None:
+    """Refuse configs of another version, whose fields may mean something else.
+
+    Raises:
+        RunError: the first two parts of the version differ.
+    """
+    if found is None or found.split(".")[:2] != __version__.split(".")[:2]:
+        raise RunError(
+            f"this config was written by pgsd_nerfstudio {found or 'of an unknown version'}, installed is {__version__}: "
+            f"train the run again, or install the version that wrote it"
+        )

@@ -1,0 +1,76 @@
+"""The viewer's knobs: play, snow on and off, size and opacity of the flakes. Nothing here is saved or learned."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerCheckbox, ViewerControl, ViewerSlider
+from torch import nn
+
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+
+TICK = 0.04  # s between looks at the clock; the time shown follows the clock however long a render takes
+
+
+class Panel(nn.Module):
+    """Found by the viewer as an attribute of the model; a module only because the viewer descends into modules."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self.seconds = seconds
+        self.shown = ViewerCheckbox("Weather", True, hint="Off: the frozen scene alone")
+        self.size = ViewerSlider("Flake size", 1.0, 0.25, 4.0, 0.05, hint="Times the learned size")
+        self.opacity = ViewerSlider("Flake opacity", 1.0, 0.0, 1.0, 0.05, hint="Times the learned opacity")
+        self.speed = ViewerSlider("Speed", 1.0, 0.1, 4.0, 0.1, hint="Seconds of weather per second")
+        self.play = ViewerButton("Play / pause", self._toggle)
+        self.control = ViewerControl()
+        self._playing = threading.Event()
+        self._player: threading.Thread | None = None
+
+    def adjusted(self, weather: Gaussians) -> Gaussians | None:
+        """The weather as the knobs want it; None where it is switched off."""
+        if not self.shown.value:
+            return None
+        if self.size.value == 1.0 and self.opacity.value == 1.0:
+            return weather
+        return replace(weather, scales=weather.scales * self.size.value, opacities=weather.opacities * self.opacity.value)
+
+    def _toggle(self, _: ViewerButton) -> None:
+        if self._playing.is_set():
+            self._playing.clear()
+            return
+        self._playing.set()
+        if self._player is None or not self._player.is_alive():
+            self._player = threading.Thread(target=self._run, name="pgsd-play", daemon=True)
+            self._player.start()
+
+    def _run(self) -> None:
+        """Move the viewer's time with the clock, over and over, as long as somebody looks on."""
+        viewer = self.control.viewer
+        last = time.monotonic()
+        while self._playing.is_set() and viewer.viser_server.get_clients():
+            time.sleep(TICK)
+            now = time.monotonic()
+            viewer.control_panel.time = (viewer.control_panel.time + self.speed.value * (now - last) / self.seconds) % 1.0
+            last = now
+            viewer._trigger_rerender()
+        self._playing.clear()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Keep the viewer from breaking off a computation whose half result would be kept.
+
+    Its render thread watches every line that runs and raises out of the middle of it when the camera moves.
+    """
+    watching = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(watching)

@@ -1,0 +1,223 @@
+"""From a config to a scene with weather: opens the scene, prepares or reads the motion prior, and takes training steps.
+
+Only under nerfstudio's Trainer is anything simulated and the video prior opened; viewer, render, eval and export read what the
+run kept.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import torchvision
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import Pipeline, VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils import writer
+from rich.console import Console
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics import RegularizationWeights, drift, regularization
+from pgsd_nerfstudio.guidance.distillation import DistilledClip
+from pgsd_nerfstudio.guidance.schedules import regularization_scale
+from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surrogate
+from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.guide import Guide, open_prior
+from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig, fidelity
+from pgsd_nerfstudio.plugin.motion import prepare_motion, stored_motion
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
+from pgsd_nerfstudio.plugin.summary import print_summary
+
+MAX_SKIPPED = 5  # steps in a row that may pass without a gradient
+
+console = Console(stderr=True, highlight=False)
+
+
+@dataclass
+class WeatherPipelineConfig(VanillaPipelineConfig):
+    """What data manager, model and pipeline share is set by the trainer's configuration, not by flags."""
+
+    _target: type = field(default_factory=lambda: WeatherPipeline)
+    datamanager: TrajectoryDataManagerConfig = field(default_factory=TrajectoryDataManagerConfig)
+    model: WeatherModelConfig = field(default_factory=WeatherModelConfig)
+    options: WeatherOptions = field(default_factory=WeatherOptions.unset)
+    run_folder: Path | None = None
+
+    def share(self, options: WeatherOptions) -> None:
+        """One record of options for all three."""
+        self.options = self.datamanager.options = self.model.options = options
+
+
+class WeatherPipeline(VanillaPipeline):
+    """Stage, motion prior, model and, in training, the guide."""
+
+    config: WeatherPipelineConfig
+    datamanager: TrajectoryDataManager
+    _model: WeatherModel
+
+    def __init__(
+        self,
+        config: WeatherPipelineConfig,
+        device: str | torch.device,
+        test_mode: Literal["test", "val", "inference"] = "val",
+        world_size: int = 1,
+        local_rank: int = 0,
+        grad_scaler: Any = None,
+    ) -> None:
+        """Open a run; with a grad_scaler, which only the Trainer passes, prepare it for training.
+
+        Raises:
+            SceneError: the scene cannot be used.
+            RunError: the motion prior or the video prior cannot be made or found.
+        """
+        Pipeline.__init__(self)
+        self._skipped = 0
+        self.config, self.test_mode, self.world_size = config, test_mode, world_size
+        self.guide: Guide | None = None
+        prior = None
+        if grad_scaler is not None:
+            # First, since a wrong path there should cost nothing yet.
+            prior, settled = open_prior(config.options, device)
+            config.share(settled)
+        config.datamanager.run_folder = config.run_folder
+        self.datamanager = config.datamanager.setup(
+            device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
+        )
+        stage = self.datamanager.stage
+        history = (stored_motion if prior is None else prepare_motion)(stage, config.options, config.run_folder)
+        self._model = config.model.setup(
+            scene_box=self.datamanager.train_dataset.scene_box,
+            num_train_data=len(self.datamanager.train_dataset),
+            stage=stage,
+            history=history.to(device),
+            exporting=test_mode == "inference",
+        )
+        self._model.to(device)
+        if prior is not None:
+            self.guide = Guide.listening(prior, config.options, stage.scene.description)
+            print_summary(console, config.options, stage, history, self.guide)
+
+    @property
+    def model(self) -> WeatherModel:
+        """The model; there is no distributed training that would wrap it."""
+        return self._model
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+        """Losses of one clip: score distillation of the video, and what holds motion and look near the simulation.
+
+        Raises:
+            RunError: the video prior's predictions are not finite, several steps in a row.
+        """
+        if self.guide is None:
+            raise RunError("this run was opened to look at, not to train")
+        model, options = self.model, self.config.options
+        stage, watch = model.stage, Stopwatch(model.stage.device)
+        cameras, batch = self.datamanager.next_train(step)
+        views, start = from_nerfstudio(cameras), int(batch["start"])
+        background = model.background_color.to(stage.device)
+        if step % options.refresh_every == 0:
+            with watch("refresh"):
+                model.rollout.refresh()
+        with watch("roll-out"):
+            seen = seen_by(stage, views, model.history, start)
+            rolled = model.rollout.window(start, len(views), visible=seen)
+            weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
+        with watch("render"):
+            clip = render_clip(stage, views, weather, background)
+        with watch("video prior"):
+            distilled = self._distilled(clip, step)
+        with watch("render, backward"):
+            video, norms = surrogate(stage, views, weather, background, distilled.gradient)
+        with watch("regularize"):
+            terms = regularization(rolled, model.look)
+            scale = regularization_scale(options.weights, distilled.loss)
+            weights = RegularizationWeights()
+            losses = {name: scale * getattr(weights, name) * value for name, value in terms.items()}
+        # The number shown is |L_SDS|, the gradient that of the surrogate.
+        losses = {"video": video - video.detach() + distilled.loss, **losses}
+        metrics = {
+            "sds": distilled.loss,
+            "timestep": distilled.timestep,
+            "drift_m": drift(rolled),
+            "particles_seen": int(seen.sum()),
+            **{f"gradient/{name}": norm for name, norm in norms.items()},
+            **{f"seconds/{name}": seconds for name, seconds in watch.seconds.items()},
+        }
+        return {}, losses, {name: torch.tensor(float(value)) for name, value in metrics.items()}
+
+    def _distilled(self, clip: Tensor, step: int) -> DistilledClip:
+        """The guide's answer; a single one that is not finite counts as none."""
+        assert self.guide is not None
+        try:
+            distilled = self.guide.gradient(clip, step)
+        except FloatingPointError as error:
+            self._skipped += 1
+            if self._skipped > MAX_SKIPPED:
+                raise RunError(f"{self._skipped} steps in a row gave nothing: {error}") from error
+            console.print(f"[yellow]step {step} gives no gradient: {error}[/]")
+            return DistilledClip(torch.zeros_like(clip), 0.0, 0)
+        self._skipped = 0
+        return distilled
+
+    def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+        """Drift over one window that training does not see."""
+        _, batch = self.datamanager.next_eval(step)
+        start, frames = int(batch["start"]), self.config.options.clip_frames or 1
+        metres = drift(self.model.rollout.frames(start, start + frames))
+        return {}, {"drift_m": torch.tensor(metres)}, {}
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """After each step the norms of its gradients go to the log; at the end the kept states follow the last weights."""
+        return [
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._log_gradients, update_every_num_iters=1),
+        ]
+
+    def _log_gradients(self, step: int) -> None:
+        for group, parameters in self.model.get_param_groups().items():
+            found = [p.grad for p in parameters if p.grad is not None]
+            if found:
+                writer.put_scalar(f"gradient/{group}", torch.stack([g.norm() for g in found]).norm(), step)
+
+    @torch.no_grad()
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, float]:
+        """What ns-eval writes, as means over the evaluation views: fidelity of the frozen scene against its photographs (where
+        there are some), how much the weather changes of the pictures, pictures per second; and the drift of the motion."""
+        self.eval()
+        model, rows = self.model, []
+        photographs = bool(model.stage.scene.images)
+        for index, (camera, batch) in enumerate(self.datamanager.fixed_indices_eval_dataloader):
+            began = time.perf_counter()
+            snowed = model.get_outputs_for_camera(camera)["rgb"]
+            row = {"fps": 1.0 / (time.perf_counter() - began)}
+            frozen = model.render(from_nerfstudio(camera).to(model.device), None).rgb[0].clamp(0, 1)
+            row["changed_by_weather"] = float((snowed - frozen).abs().mean())
+            if photographs:
+                truth = batch["image"][..., :3].to(frozen)
+                row |= {f"frozen_{name}": value for name, value in fidelity(frozen, truth).items()}
+            rows.append(row)
+            if output_path is not None:
+                output_path.mkdir(parents=True, exist_ok=True)
+                pair = torch.cat([frozen, snowed], dim=1).permute(2, 0, 1)
+                torchvision.utils.save_image(pair.cpu(), output_path / f"eval_{index:04d}.png")
+        columns = {name: torch.tensor([row[name] for row in rows]) for name in rows[0]}
+        result = {name: float(values.mean()) for name, values in columns.items()}
+        if get_std and len(rows) > 1:
+            result |= {f"{name}_std": float(values.std()) for name, values in columns.items()}
+        self.train()
+        return {**result, "drift_m": drift(model.rollout.frames())}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
+        """Always strict, where nerfstudio would silently keep what it does not find.
+
+        Raises:
+            RunError: the checkpoint does not fit.
+        """
+        prefix = "_model."
+        self._model.load_state_dict({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})

@@ -1,0 +1,39 @@
+"""The frozen scene, opened once per process and ready to be rendered; pipeline, data manager and datasets share it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.run_cameras import open_scene
+from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, choose_rasterizer
+from pgsd_nerfstudio.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A scene on one device."""
+
+    scene: Scene
+    rasterizer: Rasterizer
+    device: torch.device
+
+
+def stage_of(options: WeatherOptions, device: torch.device | str) -> Stage:
+    """The stage of a run.
+
+    Raises:
+        SceneError: the scene cannot be used.
+    """
+    return _stage(options.load_scene, options.data, options.metres_per_unit, options.scene_description, str(device))
+
+
+@lru_cache(maxsize=2)
+def _stage(path: Path, data: Path | None, metres_per_unit: float | None, description: str | None, device: str) -> Stage:
+    scene = open_scene(path, data, metres_per_unit, description)
+    rasterizer = choose_rasterizer(scene.gaussians.to(device), torch.device(device))
+    return Stage(scene, rasterizer, torch.device(device))

@@ -1,0 +1,34 @@
+"""What a run settled on, as one table at its start: the same values that config.yml keeps."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.plugin.guide import Guide
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.stage import Stage
+
+
+def print_summary(console: Console, options: WeatherOptions, stage: Stage, history: ParticleHistory, guide: Guide) -> None:
+    """Print the table."""
+    scene = stage.scene
+    rows = {
+        "scene": f"{options.load_scene} ({len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views), {scene.description}",
+        "scale and ground": scene.frame.source,
+        "device": str(stage.device),
+        "weather": f"{options.effect}, {options.chosen_effect().emission.intensity:g} mm/h, "
+        f"{options.seconds:g} s at {options.fps:g} fps",
+        "particles": f"{len(history):,} ({int(history.collided.sum()):,} of them land)",
+        "video prior": f"{guide.prior.name}",
+        "wanted": guide.wanted,
+        "not wanted": guide.unwanted,
+        "clips": f"{options.clip_frames} frames of {options.clip_width}x{options.clip_height}, paths: {options.trajectory}",
+        "training": f"{options.steps} steps, guidance {options.guidance_scale:g}, weights {options.weights}, "
+        f"learning rates {options.lr:g} (field) and {options.look_lr:g} (look)",
+    }
+    table = Table(title="pgsd-weather", show_header=False, title_justify="left", title_style="bold")
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console.print(table)

@@ -1,0 +1,63 @@
+"""The views of a scene as a dataset of nerfstudio: photographs where there are some, else renders of the frozen scene."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.scene_box import SceneBox
+from PIL import Image
+
+from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
+from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.storage import cache_dir
+
+
+class Views(InputDataset):
+    """Some of the training views, with times spread over the whole weather.
+
+    Where the scene has no photographs, each view is rendered when it is first asked for and kept as a picture in the cache.
+    """
+
+    def __init__(self, stage: Stage, indices: list[int]) -> None:
+        self.stage, self.indices = stage, indices
+        super().__init__(view_outputs(stage, indices))
+
+    def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture in the size of its camera: the photograph, or the frozen scene."""
+        path = self.image_filenames[image_idx]
+        size = (self.stage.scene.cameras.width, self.stage.scene.cameras.height)
+        if not path.is_file():
+            picture = Image.fromarray(self._render(self.indices[image_idx]))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            beside = path.with_name(f".{os.getpid()}.{path.name}")
+            picture.save(beside)
+            beside.replace(path)
+        else:
+            picture = Image.open(path).convert("RGB")
+        return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS))
+
+    def _render(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        with torch.no_grad():
+            rgb = self.stage.rasterizer.render(self.stage.scene.cameras[index].to(self.stage.device)).rgb[0]
+        return (rgb.clamp(0, 1) * 255 + 0.5).byte().cpu().numpy()
+
+
+def view_outputs(stage: Stage, indices: list[int]) -> DataparserOutputs:
+    """What a dataparser would say of these views; scene units are the run's coordinates, so its transform is the identity."""
+    scene = stage.scene
+    if scene.images and all(path.is_file() for path in scene.images):
+        names = [scene.images[i] for i in indices]
+    else:
+        folder = cache_dir() / "views" / scene.content_key()
+        names = [folder / f"view_{i:04d}.png" for i in indices]
+    centers = scene.cameras.centers
+    return DataparserOutputs(
+        image_filenames=names,
+        cameras=to_nerfstudio(scene.cameras[torch.tensor(indices)], torch.linspace(0.0, 1.0, len(indices))),
+        scene_box=SceneBox(aabb=torch.stack([centers.amin(0), centers.amax(0)])),
+    )

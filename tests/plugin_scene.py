@@ -1,0 +1,62 @@
+"""A table on a floor in 340 Gaussians, seen by six cameras of 48x32, on disk as users have it; and a run on it in three steps."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+VIEWS, WIDTH, HEIGHT = 6, 48, 32
+
+
+def write_scene(folder: Path) -> Path:
+    """Write floor.ply with its transforms.json; returns the .ply."""
+    floor = [(x, y, 0.0, 0.5) for x in np.linspace(-6, 6, 18) for y in np.linspace(-6, 6, 18)]
+    table = [(x, y, 0.8, 0.25) for x in np.linspace(-0.6, 0.6, 4) for y in np.linspace(-0.6, 0.6, 4)]
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    rows = np.zeros(len(floor) + len(table), dtype=[(name, "f4") for name in names])
+    for row, (x, y, z, size) in zip(rows, floor + table, strict=True):
+        green = 0.5 + 0.3 * math.sin(3 * x + 2 * y)
+        row["x"], row["y"], row["z"] = x, y, z
+        row["f_dc_0"], row["f_dc_1"], row["f_dc_2"] = (-0.5, green - 0.5, -0.8)
+        row["opacity"], row["rot_0"] = 5.0, 1.0
+        row["scale_0"] = row["scale_1"] = math.log(size)
+        row["scale_2"] = math.log(0.02)
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "floor.ply"))
+    frames = [{"file_path": f"{i}.png", "transform_matrix": _pose(i)} for i in range(VIEWS)]
+    intrinsics = {"fl_x": 40.0, "fl_y": 40.0, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", **intrinsics, "frames": frames}))
+    return folder / "floor.ply"
+
+
+def _pose(index: int) -> list[list[float]]:
+    angle = 2 * math.pi * index / VIEWS
+    center = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5])
+    back = torch.nn.functional.normalize(center - torch.tensor([0.0, 0.0, 0.4]), dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
+    pose = torch.eye(4)
+    pose[:3] = torch.stack([right, torch.linalg.cross(back, right), back, center], dim=1)
+    return pose.tolist()
+
+
+def tiny_config(scene: Path, prior: Path, outputs: Path, **flags):
+    """What `ns-train pgsd-weather` would be configured with: one second of weather, 300 particles, clips of 5 frames."""
+    from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
+
+    small = {"seconds": 0.8, "max_particles": 300, "steps": 3, "clip_frames": 5, "refresh_every": 2, "intensity": 3.0}
+    flags = {**small, "data": scene.parent, "output_dir": outputs, "timestamp": "now", "prior": str(prior), **flags}
+    return WeatherTrainerConfig(load_scene=scene, **flags)
+
+
+def train(config) -> Path:
+    """As nerfstudio's train.main does; returns config.yml."""
+    torch.manual_seed(config.machine.seed)
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.train()
+    return config.get_base_dir() / "config.yml"

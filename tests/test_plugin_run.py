@@ -1,0 +1,226 @@
+"""A run from training to video, through nerfstudio's own classes; trained once, in three steps."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from guidance_tiny import write_tiny
+from plugin_scene import HEIGHT, VIEWS, WIDTH, tiny_config, train, write_scene
+
+from pgsd_nerfstudio.physics import simulate as simulation
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
+
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("prior"))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, prior: Path) -> Path:
+    """config.yml of the run."""
+    folder = tmp_path_factory.mktemp("scene")
+    return train(tiny_config(write_scene(folder), prior, folder / "outputs"))
+
+
+@pytest.fixture
+def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same, in a process that must not simulate nor open a video prior."""
+
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("only training may do this")
+
+    monkeypatch.setattr(simulation, "simulate", forbidden)
+    monkeypatch.setattr(simulation, "motion_prior", forbidden)
+    monkeypatch.setattr("pgsd_nerfstudio.guidance.prior.VideoPrior.load", forbidden)
+    return trained
+
+
+def opened(config: Path, mode: str = "test"):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    return eval_setup(config, test_mode=mode)[1]  # type: ignore[arg-type]
+
+
+def at(pipeline, time: float | None) -> torch.Tensor:
+    """The picture of the first view at a time."""
+    camera = to_nerfstudio(pipeline.model.stage.scene.cameras[0], None if time is None else torch.tensor([time]))
+    return pipeline.model.get_outputs_for_camera(camera)["rgb"]
+
+
+def test_training_leaves_a_config_a_checkpoint_and_the_motion_prior(trained: Path):
+    left = {path.relative_to(trained.parent).as_posix() for path in trained.parent.rglob("*") if path.is_file()}
+    assert {"config.yml", "motion_prior.safetensors", "dataparser_transforms.json", "nerfstudio_models/step-000000002.ckpt"} <= left
+    config = yaml.load(trained.read_text(), Loader=yaml.Loader)
+    assert (config.clip_frames, config.clip_height, config.clip_width) == (5, 32, 48), "settled defaults are saved"
+    assert config.pipeline.options.clip_width == 48
+
+
+def test_only_what_is_learned_lies_in_the_checkpoint(run: Path):
+    state = torch.load(next(run.parent.glob("nerfstudio_models/*.ckpt")))["pipeline"]
+    assert {key.split(".")[1] for key in state} == {"field", "look", "device_indicator_param"}
+    pipeline = opened(run)
+    moved = [value for key, value in state.items() if "look" in key]
+    assert all(bool(value.any()) for value in moved), "the learned look has left its start"
+    for key, value in pipeline.state_dict().items():
+        torch.testing.assert_close(value, state[key])
+
+
+def test_the_picture_follows_the_time_of_the_camera(run: Path):
+    pipeline = opened(run)
+    first, middle, last = (at(pipeline, time) for time in (0.0, 0.5, 1.0))
+    assert first.shape == (HEIGHT, WIDTH, 3)
+    assert float((first - middle).abs().max()) > 0.05 and float((middle - last).abs().max()) > 0.05
+    torch.testing.assert_close(at(pipeline, 0.0), first, atol=1e-6, rtol=0)
+    torch.testing.assert_close(at(pipeline, 0.4 / (FRAMES - 1)), first, atol=1e-6, rtol=0)
+
+
+def test_renders_without_a_time_advance_frame_by_frame_and_start_over(run: Path):
+    pipeline = opened(run)
+    timed = [at(pipeline, frame / (FRAMES - 1)) for frame in range(FRAMES)]
+    untimed = [at(pipeline, None) for _ in range(FRAMES + 1)]
+    for a, b in zip([*timed, timed[0]], untimed, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
+
+
+def test_the_knobs_change_the_picture(run: Path):
+    pipeline = opened(run)
+    panel, snowed = pipeline.model.weather, at(pipeline, 0.5)
+    panel.size.value = 3.0
+    assert float((at(pipeline, 0.5) - snowed).abs().max()) > 0.05
+    panel.shown.value = False
+    frozen = pipeline.model.render(pipeline.model.stage.scene.cameras[0], None).rgb[0].clamp(0, 1)
+    torch.testing.assert_close(at(pipeline, 0.5), frozen)
+
+
+def test_depth_and_accumulation_come_along(run: Path):
+    pipeline = opened(run)
+    outputs = pipeline.model.get_outputs_for_camera(to_nerfstudio(pipeline.model.stage.scene.cameras[0], torch.zeros(1)))
+    assert {name: tuple(value.shape) for name, value in outputs.items()} == {
+        "rgb": (HEIGHT, WIDTH, 3),
+        "depth": (HEIGHT, WIDTH, 1),
+        "accumulation": (HEIGHT, WIDTH, 1),
+        "background": (HEIGHT, WIDTH, 3),
+    }
+    depth = outputs["depth"][HEIGHT - 1, WIDTH // 2, 0]
+    assert 1.0 < float(depth) < 4.0, "the floor before the camera"
+
+
+def test_the_crop_box_of_the_viewer_cuts_scene_and_weather(run: Path):
+    from nerfstudio.data.scene_box import OrientedBox
+
+    pipeline = opened(run)
+    camera = to_nerfstudio(pipeline.model.stage.scene.cameras[0], torch.ones(1))
+    box = OrientedBox(R=torch.eye(3), T=torch.tensor([0.0, 0, 0.8]), S=torch.tensor([2.0, 2, 0.4]))
+    cut = pipeline.model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
+    whole = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
+    assert 0.01 < float(cut.mean()) < 0.6 * float(whole.mean())
+
+
+def test_a_run_without_its_motion_prior_names_the_command_that_makes_it(run: Path, tmp_path: Path):
+    copy = copied(run, tmp_path)
+    (copy.parent / "motion_prior.safetensors").unlink()
+    with pytest.raises(RunError, match=r"motion prior .* missing or damaged.*ns-train pgsd-weather --load-scene .*floor\.ply"):
+        opened(copy)
+
+
+def test_a_scene_that_changed_since_is_refused(run: Path, tmp_path: Path):
+    copy = copied(run, tmp_path)
+    copy.write_text(copy.read_text().replace("metres_per_unit: null", "metres_per_unit: 2.0"))
+    with pytest.raises(RunError, match="is not the scene this run was trained on"):
+        opened(copy)
+
+
+def test_a_checkpoint_that_lacks_a_tensor_is_refused(run: Path, tmp_path: Path):
+    copy = copied(run, tmp_path)
+    path = next(copy.parent.glob("nerfstudio_models/*.ckpt"))
+    stored = torch.load(path)
+    del stored["pipeline"]["_model.look.active"]
+    torch.save(stored, path)
+    with pytest.raises(RunError, match=r"does not fit this version.*look\.active"):
+        opened(copy)
+
+
+def test_training_goes_on_from_a_checkpoint(trained: Path, prior: Path, tmp_path: Path):
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    more = train(tiny_config(scene, prior, tmp_path, steps=1, load_dir=trained.parent / "nerfstudio_models"))
+    assert [path.name for path in (more.parent / "nerfstudio_models").iterdir()] == ["step-000000003.ckpt"]
+
+
+def test_the_same_seed_learns_the_same(trained: Path, prior: Path, tmp_path: Path):
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    again = train(tiny_config(scene, prior, tmp_path))
+    ours, theirs = (torch.load(next(p.parent.glob("nerfstudio_models/*.ckpt")))["pipeline"] for p in (trained, again))
+    for key, value in ours.items():
+        torch.testing.assert_close(value, theirs[key], atol=1e-5, rtol=1e-4, msg=key)
+
+
+def test_weather_shorter_than_a_clip_is_refused(prior: Path, tmp_path: Path):
+    with pytest.raises(RunError, match=r"the weather has 3 frames .* a training clip 5"):
+        train(tiny_config(write_scene(tmp_path), prior, tmp_path, seconds=0.12))
+
+
+def test_a_folder_that_is_no_video_prior_is_refused_before_anything_is_simulated(tmp_path: Path):
+    with pytest.raises(RunError, match="CogVideoX"):
+        train(tiny_config(write_scene(tmp_path), tmp_path, tmp_path / "outputs"))
+
+
+def test_ns_eval_writes_plain_numbers(run: Path, tmp_path: Path):
+    from nerfstudio.scripts.eval import ComputePSNR
+
+    ComputePSNR(run, tmp_path / "eval.json", tmp_path / "pictures").main()
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    assert {"fps", "changed_by_weather", "drift_m"} <= set(results) and all(isinstance(v, float) for v in results.values())
+    assert 0 < results["drift_m"] < 0.1 and results["changed_by_weather"] > 0
+    assert len(list((tmp_path / "pictures").iterdir())) == VIEWS
+
+
+def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Path):
+    from nerfstudio.scripts.exporter import ExportGaussianSplat
+
+    from pgsd_nerfstudio.scene.splats import read_ply
+
+    ExportGaussianSplat(load_config=run, output_dir=tmp_path).main()
+    pipeline = opened(run)
+    scene, weather = pipeline.model.stage.scene.gaussians, pipeline.model.weather_at(FRAMES - 1)
+    stored = read_ply(tmp_path / "splat.ply")
+    visible = weather.opacities > 1 / 255
+    assert len(stored) == len(scene) + int(visible.sum()) and len(weather) > 50
+    torch.testing.assert_close(stored.means[: len(scene)], scene.means)
+    torch.testing.assert_close(stored.scales[len(scene) :], weather.scales[visible], rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(stored.opacities[len(scene) :], weather.opacities[visible], rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(0.5 + 0.28209479 * stored.colors[len(scene) :, 0], weather.colors[visible], rtol=1e-3, atol=1e-4)
+
+
+def test_ns_render_writes_all_four_kinds_of_video(run: Path, tmp_path: Path):
+    import imageio_ffmpeg
+    from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated, SpiralRender
+
+    RenderInterpolated(run, tmp_path / "interpolate.mp4", interpolation_steps=2).main()
+    SpiralRender(run, tmp_path / "spiral.mp4", seconds=0.25).main()
+    matrix = opened(run).model.stage.scene.cameras.opengl()[0].flatten().tolist()
+    keyframes = [{"camera_to_world": matrix, "fov": 50, "aspect": 1.5, "render_time": time} for time in (0.0, 0.5, 1.0)]
+    path = {"render_width": 48, "render_height": 32, "seconds": 0.2, "camera_path": keyframes}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    RenderCameraPath(run, tmp_path / "path.mp4", camera_path_filename=tmp_path / "path.json").main()
+    frames = {path.name: imageio_ffmpeg.count_frames_and_secs(str(path))[0] for path in tmp_path.glob("*.mp4")}
+    assert frames == {"interpolate.mp4": 2 * (VIEWS - 1), "spiral.mp4": 6, "path.mp4": 3}
+    DatasetRender(run, tmp_path / "dataset", image_format="png").main()
+    assert len(list((tmp_path / "dataset/test/rgb").iterdir())) == len(list((tmp_path / "dataset/test/gt-rgb").iterdir())) == VIEWS
+
+
+def copied(run: Path, tmp_path: Path) -> Path:
+    """A copy of the run elsewhere; returns its config.yml."""
+    folder = tmp_path / run.parent.relative_to(run.parents[4])
+    shutil.copytree(run.parent, folder)
+    config = folder / "config.yml"
+    loaded = yaml.load(config.read_text(), Loader=yaml.Loader)
+    loaded.output_dir = folder.parents[2]
+    config.write_text(yaml.dump(loaded))
+    return config
