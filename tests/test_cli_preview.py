@@ -1,0 +1,132 @@
+"""Laws of `pgsd preview`: what a new user tries first says clearly what is wrong, and shows the scene with weather in it."""
+
+import json
+import math
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from pgsd_nerfstudio.cli.main import run
+
+FIELDS = [
+    "x",
+    "y",
+    "z",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
+    *(f"rot_{i}" for i in range(4)),
+]
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory):
+    """A dark floor of 6 x 6 m as a splat, and eight views of it from a ring: (the .ply, the folder of transforms.json)."""
+    folder = tmp_path_factory.mktemp("yard")
+    side = np.linspace(-3, 3, 50, dtype=np.float32)
+    points = np.zeros(side.size**2, dtype=[(name, "f4") for name in FIELDS])
+    points["x"], points["y"] = (axis.ravel() for axis in np.meshgrid(side, side))
+    points["f_dc_0"] = points["f_dc_1"] = points["f_dc_2"] = (0.1 - 0.5) / 0.28209479
+    points["opacity"], points["rot_0"] = 6.0, 1.0
+    points["scale_0"] = points["scale_1"] = math.log(0.08)
+    points["scale_2"] = math.log(0.005)
+    PlyData([PlyElement.describe(points, "vertex")]).write(str(folder / "yard.ply"))
+    frames = [{"file_path": f"images/{i}.jpg", "transform_matrix": look_inward(i * math.pi / 4).tolist()} for i in range(8)]
+    capture = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 80.0, "cx": 48.0, "cy": 32.0, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(capture))
+    return folder / "yard.ply", folder
+
+
+def look_inward(azimuth: float) -> np.ndarray:
+    """Camera to world (OpenGL) at 4 m from the middle and 1.5 m above the floor."""
+    center = np.array([4 * math.cos(azimuth), 4 * math.sin(azimuth), 1.5])
+    back = center / np.linalg.norm(center)
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, center], axis=1)
+    return pose
+
+
+def preview(yard, output, **flags) -> int:
+    ply, data = yard
+    words = {"load-scene": ply, "data": data, "output": output, "frames": 4, "width": 96, "height": 64, "seconds": 1.0} | flags
+    return run(
+        [
+            "preview",
+            *(str(word) for name, value in words.items() if value is not None for word in (f"--{name}", *_words(value))),
+        ]
+    )
+
+
+def _words(value):
+    return value if isinstance(value, tuple) else (value,)
+
+
+def test_a_preview_shows_the_scene_with_something_bright_falling_in_it(yard, tmp_path, capsys):
+    assert preview(yard, tmp_path / "v.mp4", **{"max-particles": 2000}) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / "v.mp4"), str(tmp_path / "v.png")]
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "v.mp4"))
+    about = next(reader)
+    frames = np.stack([np.frombuffer(frame, np.uint8).reshape(64, 96, 3) for frame in reader]).astype(float)
+    assert about["size"] == (96, 64) and len(frames) == 4
+    # The floor is a tenth as bright as white: what is brighter is weather, and it moves.
+    assert 0.001 < (frames[0] > 100).mean() < 0.5
+    assert (abs(frames[1] - frames[0]) > 50).any()
+    poster = np.asarray(Image.open(tmp_path / "v.png")).astype(float)
+    assert abs(poster - frames[-1]).mean() < 6
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["v.mp4", "v.png"]
+
+
+def test_the_same_preview_twice_is_the_same_picture(yard, tmp_path):
+    pictures = []
+    for name in ("a", "b"):
+        assert preview(yard, tmp_path / f"{name}.mp4", frames=1, **{"max-particles": 500}) == 0
+        pictures.append((tmp_path / f"{name}.png").read_bytes())
+    assert pictures[0] == pictures[1]
+    assert preview(yard, tmp_path / "c.mp4", frames=1, seed=1, **{"max-particles": 500}) == 0
+    assert (tmp_path / "c.png").read_bytes() != pictures[0]
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ({"load-scene": "nowhere"}, "no scene at nowhere"),
+        ({"data": None}, "pass --data"),
+        ({"data": "nowhere"}, "no data at nowhere"),
+        ({"effect": "hail"}, "known are: "),
+        ({"frames": 0}, "--frames must be positive, got 0"),
+        ({"fps": "nan"}, "--fps must be positive, got nan"),
+        ({"width": 8}, "at least 16x16 pixels, got 8x64"),
+        ({"output": "v.avi"}, "--output must end in .mp4, got v.avi"),
+        ({"start": -1}, "--start must not be negative, got -1 s"),
+        ({"intensity": -2}, "intensity must lie in"),
+        ({"max-particles": 0}, "--max-particles must be positive, got 0"),
+        ({"views": (0, 8)}, "--views must lie in 0-7"),
+        ({"metres-per-unit": -1}, "metres per scene unit must be a positive number"),
+        ({"output": "/proc/none/v.mp4"}, "/proc/none/v.mp4 cannot be written (No such file or directory); choose another"),
+    ],
+)
+def test_bad_input_gets_one_sentence_and_exit_code_1(yard, tmp_path, capsys, monkeypatch, flags, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert preview(yard, **({"output": tmp_path / "v.mp4"} | flags)) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pgsd: ")]
+    assert len(said) == 1 and sentence in said[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_splat_that_is_none_is_named(yard, tmp_path, capsys):
+    (tmp_path / "text.ply").write_text("no splat at all")
+    assert preview(yard, tmp_path / "v.mp4", **{"load-scene": tmp_path / "text.ply"}) == 1
+    assert "text.ply" in capsys.readouterr().err
+    assert not (tmp_path / "v.mp4").exists()
+
+
+def test_wrong_usage_is_exit_code_2():
+    with pytest.raises(SystemExit) as exit_:
+        run(["preview", "--load-scene", "demo", "--framez", "3"])
+    assert exit_.value.code == 2
