@@ -138,7 +138,8 @@ def _meet(air: Air, before: Float[ndarray, "n 3"], bodies: Bodies) -> tuple[ndar
     meeting = air.ground.meet(before, bodies.positions)
     bodies.positions[meeting.which] = meeting.points
     hold = air.ground.holds(meeting.normals, bodies.holds[meeting.which])
-    out = ((bodies.positions < np.float32(air.domain.lower)) | (bodies.positions > np.float32(air.domain.upper))).any(1)
+    lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
+    out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
     out[meeting.which] = False
     flies = ~out
     flies[meeting.which] = False
