@@ -11,7 +11,7 @@ import json
 import os
 import uuid
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +73,13 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, 
     beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
     try:
         data = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        save_file(data, beside, metadata={"about": json.dumps(asdict(about) if is_dataclass(about) else dict(about or {}))})
-        os.replace(beside, path)
+        save_file(data, beside, metadata={"about": json.dumps(dict(about or {}))})
+        beside.replace(path)
     except (OSError, SafetensorError) as error:
         beside.unlink(missing_ok=True)
-        raise OSError(f"could not write {path}: {error}; free some space or set PGSD_CACHE to a folder on another disk") from error
+        raise OSError(
+            f"could not write {path}: {error}; free some space or set PGSD_CACHE to a folder on another disk"
+        ) from error
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -86,11 +88,8 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         return None
     try:
         with safe_open(path, framework="pt") as stored:
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}
+            tensors = {name: stored.get_tensor(name) for name in list(stored.keys())}
             return tensors, json.loads((stored.metadata() or {}).get("about", "{}"))
     except (SafetensorError, OSError, json.JSONDecodeError):
         path.unlink(missing_ok=True)
         return None
-
-
-__all__ = ["cache_dir", "content_key", "load_tensors", "save_tensors"]

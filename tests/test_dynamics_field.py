@@ -8,6 +8,7 @@ from dynamics_particles import falling, looks, rollout
 
 from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook
 from pgsd_nerfstudio.dynamics.encodings import fourier, sinusoidal
+from pgsd_nerfstudio.dynamics.field import StateNet
 from pgsd_nerfstudio.dynamics.look import clamp
 from pgsd_nerfstudio.dynamics.state import turned
 
@@ -36,6 +37,14 @@ def test_architecture_is_the_papers():
         assert (net.first.in_features, net.first.out_features) == (3 * 24 + 7, 128)
         assert (net.second.in_features, net.second.out_features) == (128, 128)
         assert sum(head.out_features for head in net.heads.values()) == heads
+
+
+def test_shared_inputs_give_what_the_plain_network_gives():
+    net = StateNet({"velocity": 3})
+    torch.nn.init.normal_(net.heads["velocity"].weight)
+    own, shared = torch.randn(20, 50), torch.randn(1, 29)
+    plain = torch.nn.Sequential(net.first, torch.nn.ReLU(), net.second, torch.nn.ReLU(), net.heads["velocity"], torch.nn.Tanh())
+    torch.testing.assert_close(net(own, shared)["velocity"], plain(torch.cat([own, shared.expand(20, 29)], dim=1)))
 
 
 def test_field_is_still_until_a_head_moves():

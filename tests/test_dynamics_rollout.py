@@ -1,6 +1,7 @@
 """The roll-out against the simulation, against a plain per-particle loop of the paper's equations, and against itself."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import roma
@@ -11,6 +12,7 @@ from pgsd_nerfstudio.dynamics import rollout as rollout_module
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND
 from pgsd_nerfstudio.dynamics.state import LANDING_FRAMES
 
+STATES = ("active", "collided")
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -45,6 +47,7 @@ def test_untrained_field_costs_nothing_without_gradient(monkeypatch):
     roll.gaussians(len(roll) - 1)
 
 
+@torch.no_grad()
 def plain_loop(roll, particle):
     """The paper's eq. residual_motion for one particle, frame by frame: {frame: (x, R, opacity, scales, rgb)}."""
     history, field, look = roll.history, roll.field, roll.look
@@ -154,6 +157,31 @@ def test_gradient_runs_through_all_frames_and_detach_cuts_it():
         last.gaussians.means[row, 2].backward()
         gradient = roll.field.active_net.heads["velocity"].bias.grad
         torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, steps * roll.field.bounds.velocity]))
+
+
+def test_gradient_is_that_of_central_differences():
+    """Along a random direction of all weights, clear of kinks: white colours and walls of the domain, where values saturate."""
+    roll = double(rollout(falling(count=30), weights=0.02))
+    roll.look = replace(
+        roll.look, **{name: replace(getattr(roll.look, name), rgb=torch.full((30, 3), 0.5).double()) for name in STATES}
+    )
+    roll.field.box += torch.tensor([[-1.0], [1.0]]).double()
+    weights = list(roll.field.parameters())
+    direction = [torch.randn(w.shape, generator=torch.Generator().manual_seed(i)).double() for i, w in enumerate(weights)]
+
+    def value():
+        return torch.stack(
+            [getattr(r.gaussians, name).sin().sum() for r in roll.window(15, 9, begin="simulation") for name in FIELDS]
+        ).sum()
+
+    gradients = torch.autograd.grad(value(), weights)
+    slope = float(sum((g * d).sum() for g, d in zip(gradients, direction, strict=True)))
+    ends = []
+    with torch.no_grad():
+        for step in (1e-6, -2e-6):
+            torch._foreach_add_(weights, direction, alpha=step)
+            ends.append(float(value()))
+    assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(slope, rel=1e-4)
 
 
 def test_a_particle_lands_where_the_simulation_lands():

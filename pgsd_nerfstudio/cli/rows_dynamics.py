@@ -161,8 +161,8 @@ def _landing_error(roll: Rollout) -> float:
 def _gradient_error(roll: Rollout) -> float:
     """Relative error of the derivative along one direction of all weights, for colours that stay clear of white: where a value
     saturates, its gradient is one-sided on purpose."""
-    states = (replace(state, rgb=0.8 * state.rgb) for state in (roll.look.active, roll.look.collided))
-    roll = Rollout(roll.history, InitialLook(*states, roll.look.settle_seconds), roll.field)
+    active, collided = (replace(state, rgb=0.8 * state.rgb) for state in (roll.look.active, roll.look.collided))
+    roll = Rollout(roll.history, InitialLook(active, collided, roll.look.settle_seconds), roll.field)
     start = len(roll) - CLIP
     parameters = list(roll.field.parameters())
     rng = torch.Generator().manual_seed(0)
@@ -170,7 +170,7 @@ def _gradient_error(roll: Rollout) -> float:
 
     def value() -> Tensor:
         clip = roll.window(start, CLIP, begin="simulation")
-        return torch.stack([sum(getattr(r.gaussians, name).sin().sum() for name in FIELDS) for r in clip]).sum()
+        return torch.stack([getattr(r.gaussians, name).sin().sum() for r in clip for name in FIELDS]).sum()
 
     gradients = torch.autograd.grad(value(), parameters)
     slope = float(sum((g * d).sum() for g, d in zip(gradients, direction, strict=True)))

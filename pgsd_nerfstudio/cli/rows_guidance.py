@@ -154,9 +154,9 @@ def _pipeline_row() -> Record:
     frames, height, width = prior.clip_shape
     noisy = prior.encode(torch.rand(frames, 3, height, width, generator=torch.Generator().manual_seed(0)))
     length = prior.transformer.config.max_text_seq_length
-    pipeline(
-        *TEXTS, height, width, frames, 2, guidance_scale=6.0, latents=noisy, output_type="latent", max_sequence_length=length
-    )
+    size = {"height": height, "width": width, "num_frames": frames}
+    how = {"num_inference_steps": 2, "guidance_scale": 6.0, "output_type": "latent", "max_sequence_length": length}
+    pipeline(prompt=TEXTS[0], negative_prompt=TEXTS[1], latents=noisy, **size, **how)  # type: ignore[arg-type]
     worst = 0.0
     for truth, timestep in caught:
         v_negative, v_text = prior.predict_v(noisy, timestep, torch.cat([negative, text])).split(1)

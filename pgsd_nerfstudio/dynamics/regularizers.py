@@ -84,7 +84,7 @@ def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Te
 
 def drift(frames: Iterable[RolledFrame]) -> float:
     """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
-    means = [float(rolled.offset.norm(dim=1).mean()) for rolled in frames if len(rolled.active)]
+    means = [float(rolled.offset.detach().norm(dim=1).mean()) for rolled in frames if len(rolled.active)]
     return sum(means) / len(means) if means else 0.0
 
 

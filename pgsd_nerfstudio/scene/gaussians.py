@@ -72,8 +72,7 @@ class Gaussians:
     @staticmethod
     def empty(device: torch.device | str = "cpu") -> Gaussians:
         """No Gaussians, plain RGB."""
-        z = torch.zeros
-        return Gaussians(z(0, 3, device=device), z(0, 4, device=device), z(0, 3, device=device), z(0, device=device), z(0, 3, device=device))
+        return Gaussians(*(torch.zeros(0, *shape, device=device) for shape in ((3,), (4,), (3,), (), (3,))))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:

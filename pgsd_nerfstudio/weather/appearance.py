@@ -21,11 +21,16 @@ from pgsd_nerfstudio.weather.effect import Effect, StateLook
 class Particles(Protocol):
     """What a look needs to know of the simulated particles (physics.ParticleHistory has it)."""
 
-    ends: Int[Tensor, "p"]
-    diameters: Float[Tensor, "p"]
-    represents: Float[Tensor, "p"]
-    rest_extents: Float[Tensor, "p"]
-    fps: float
+    @property
+    def ends(self) -> Int[Tensor, "p"]: ...
+    @property
+    def diameters(self) -> Float[Tensor, "p"]: ...
+    @property
+    def represents(self) -> Float[Tensor, "p"]: ...
+    @property
+    def rest_extents(self) -> Float[Tensor, "p"]: ...
+    @property
+    def fps(self) -> float: ...
 
     def __len__(self) -> int: ...
 
