@@ -21,7 +21,7 @@ CAMERA_HEIGHT = 1.5  # m above the ground, of a camera held by a standing person
 SNAP = 2.0  # degrees: an estimated up this close to +z is +z
 ORIENTED_WITHIN = 25.0  # degrees: where up cannot be estimated well, a +z this close to the cameras' mean up is trusted
 MIN_SPREAD = 0.05  # mean square of the horizontal axes across their main direction: views from an arc of 45 degrees
-CELLS = 40  # ground samples across the area inside the cameras' ring
+CELLS = 32  # ground samples across the area inside the cameras' ring
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +122,11 @@ def _up(cameras: Cameras) -> tuple[Float[Tensor, "3"], str]:
     """
     axes = torch.linalg.inv(cameras.viewmats.double())[:, :3, :3]
     right, mean_up = axes[:, :, 0], torch.nn.functional.normalize(-axes[:, :, 1].mean(0), dim=0)  # OpenCV's y points down
-    up, weight = mean_up, torch.ones(len(cameras), 1, dtype=torch.float64)
-    for _ in range(20):  # reweighted to absolute deviations: a few cameras held sideways do not tilt it
+    up, spread = mean_up, torch.zeros(3, dtype=torch.float64)
+    for _ in range(20):  # weighted to absolute deviations: a few cameras held sideways do not tilt it
+        weight = 1 / (right @ up).abs().clamp_min(1e-2)[:, None]
         spread, vectors = torch.linalg.eigh((weight * right).T @ right / weight.sum())
         up = vectors[:, 0] * (vectors[:, 0] @ mean_up).sign()
-        weight = 1 / (right @ up).abs().clamp_min(1e-2)[:, None]
     from_z = math.degrees(math.acos(float(up[2].clamp(-1, 1))))
     if spread[1] > max(MIN_SPREAD, 10 * spread[0]) and up @ mean_up > 0.5:
         if from_z > SNAP:
@@ -178,7 +178,7 @@ def _ground(
     by_cell = torch.argsort(cell_id, stable=True)
     _, counts = torch.unique_consecutive(cell_id[by_cell], return_counts=True)
     first = counts.cumsum(0) - counts
-    votes = sorted_heights[by_cell][first + counts // 10][counts >= min(4, int(counts.max()))]
+    votes = sorted_heights[by_cell][first + counts // 10]
     tolerance = 0.02 * radius
     near = (votes[:, None] - votes[None, :]).abs() < tolerance
     level = votes[near.sum(1).argmax()]

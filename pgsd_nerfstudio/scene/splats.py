@@ -73,7 +73,7 @@ def read_checkpoint(path: Path) -> Gaussians:
         SceneError: the file is not a readable checkpoint, is not splatfacto's or is empty, or a field holds a NaN or infinity.
     """
     # Checkpoints of schedules with decay hold NumPy scalars, saved under the module names of NumPy 1 or 2.
-    from numpy.core.multiarray import scalar
+    from numpy.core.multiarray import scalar  # pyright: ignore[reportAttributeAccessIssue]
 
     dtypes = [np.dtype, *{type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)}]
     allowed: list[Any] = [scalar, (scalar, "numpy._core.multiarray.scalar"), *dtypes]

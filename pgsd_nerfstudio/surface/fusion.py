@@ -6,6 +6,7 @@ Curless & Levoy, "A volumetric method for building complex models from range ima
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,12 @@ from torch import Tensor
 from pgsd_nerfstudio.scene.cameras import Cameras
 
 BLOCK = 8  # voxels along the edge of a block
+FAR_AWAY = 1e6  # m, depth of the sky
+
+
+def open3d() -> Any:
+    """Open3D, imported when first needed: that takes seconds. Untyped, since its stubs know no NumPy arrays."""
+    return importlib.import_module("open3d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +57,17 @@ def fuse(
     region: Region = everywhere,
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Vertices in metres and triangles, those with their middle in the region; their winding faces the side the cameras saw."""
-    import open3d as o3d
-
+    o3d = open3d()
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), fusion.voxel, BLOCK, 4096, core.Device("CPU:0")
     )
     views = []
     for depth, viewmat, K in zip(depths, cameras.viewmats, cameras.Ks, strict=True):
-        # What lies beyond reach, and the sky, is free space as far as we look, without surface there.
-        touched = _image(o3d, torch.where(depth < fusion.reach, depth, 0.0))
+        # What lies beyond reach, and the sky, clears the space before it but touches no blocks.
+        touched = _image(torch.where(depth < fusion.reach, depth, 0.0))
         camera = (core.Tensor(K.double().cpu().numpy()), core.Tensor(viewmat.double().cpu().numpy()))
-        views.append((_image(o3d, depth.clamp(max=fusion.reach)), camera))
+        views.append((_image(depth.clamp(max=FAR_AWAY)), camera))
         if touched.as_tensor().numpy().any():
             blocks = grid.compute_unique_block_coordinates(touched, *camera, 1.0, fusion.reach, fusion.truncation)
             _activate(grid, blocks, fusion.voxel * BLOCK, region)
@@ -69,7 +75,7 @@ def fuse(
         return _nothing()
     blocks = grid.hashmap().key_tensor()[grid.hashmap().active_buf_indices().to(core.int64)]
     for image, camera in views:
-        grid.integrate(blocks, image, *camera, 1.0, 1.001 * fusion.reach, fusion.truncation)
+        grid.integrate(blocks, image, *camera, 1.0, 2 * FAR_AWAY, fusion.truncation)
     mesh = grid.extract_triangle_mesh(0.5)
     if mesh.is_empty() or "indices" not in mesh.triangle:
         return _nothing()
@@ -82,26 +88,27 @@ def _activate(grid: Any, blocks: Any, edge: float, region: Region) -> None:
     centers = (blocks.numpy() + 0.5) * edge
     near = np.flatnonzero(region(centers.astype(np.float32)) < edge)
     if len(near):
-        import open3d as o3d
-
-        grid.hashmap().activate(o3d.core.Tensor(np.ascontiguousarray(blocks.numpy()[near])))
+        grid.hashmap().activate(open3d().core.Tensor(np.ascontiguousarray(blocks.numpy()[near])))
 
 
 def without_silhouettes(
     depth: Float[Tensor, "h w"],  # m; 0 where unknown, inf where the sky was
     focal: float,  # pixels
-    edge: float = 60.0,
+    pixels: float = 60.0,
+    share: float = 0.1,
 ) -> Float[Tensor, "h w"]:
-    """Depth with 0 at pixels that differ from a neighbour by more than `edge` pixel widths, the borders of the sky among them.
+    """Depth with 0 beside silhouettes and the sky, where the expected depth lies between two surfaces and on neither.
 
-    There the expected depth lies between two surfaces and on neither. 60 pixel widths leave surfaces seen at 2 degrees or more.
+    A silhouette is where neighbours differ by more than a surface explains that is seen at 2 degrees (a step of 60 pixel
+    widths), or by a tenth of the depth.
     """
-    image = np.pad(depth.float().cpu().clamp(max=1e6).numpy(), 1, mode="edge")
+    edge = min(pixels / focal, share)
+    image = np.pad(depth.float().cpu().clamp(max=FAR_AWAY).numpy(), 1, mode="edge")
     high = np.maximum(np.maximum(image[:-2], image[1:-1]), image[2:])
     low = np.minimum(np.minimum(image[:-2], image[1:-1]), image[2:])
     high = np.maximum(np.maximum(high[:, :-2], high[:, 1:-1]), high[:, 2:])
     low = np.minimum(np.minimum(low[:, :-2], low[:, 1:-1]), low[:, 2:])
-    return torch.where(torch.from_numpy(high - low) <= edge / focal * depth.cpu(), depth.cpu(), 0.0)
+    return torch.where(torch.from_numpy(high - low) <= edge * depth.cpu(), depth.cpu(), 0.0)
 
 
 def _without_crumbs(
@@ -120,18 +127,27 @@ def _without_crumbs(
     np.minimum.at(low, component, vertices)
     np.maximum.at(high, component, vertices)
     large = (high - low).max(1) >= size
-    return compact(vertices, triangles[large[component[triangles[:, 0]]]])
+    return _in_order(vertices, triangles[large[component[triangles[:, 0]]]])
 
 
-def compact(
+def _in_order(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The mesh with only the vertices that its triangles use."""
+    """The mesh with only the vertices that its triangles use, in an order that does not depend on the order of threads."""
     used, renumbered = np.unique(triangles, return_inverse=True)
-    return vertices[used].astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32)
+    vertices, triangles = vertices[used].astype(np.float32), renumbered.reshape(-1, 3)
+    order = np.lexsort(vertices.T)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    triangles = rank[triangles]
+    # Turned until the lowest index comes first, which keeps the winding.
+    turned = (triangles.argmin(1)[:, None] + np.arange(3)) % 3
+    triangles = np.take_along_axis(triangles, turned, axis=1)
+    return vertices[order], triangles[np.lexsort(triangles.T[::-1])]
 
 
-def _image(o3d: Any, depth: Float[Tensor, "h w"]) -> Any:
+def _image(depth: Float[Tensor, "h w"]) -> Any:
+    o3d = open3d()
     return o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth.float().cpu().numpy())[:, :, None]))
 
 
