@@ -1,0 +1,48 @@
+"""Makes docs/benchmarks.md from what `pgsd bench` and `pgsd verify` wrote, so that the page says only what a run printed.
+
+pgsd bench --json docs/figures/bench.json
+pgsd verify --json docs/figures/verify.json
+python scripts/make_benchmarks_page.py
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+
+from pgsd_nerfstudio.cli.records import Record, figure, read_records, split_source, verdict
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+HEAD = """# Figures
+
+Made by `scripts/make_benchmarks_page.py` from the JSON files in `docs/figures/`; edit none of it by hand. Each heading is the
+command that prints the rows below it again. An error stands beside every speed that was paid for with one. "-" in the last
+column: nothing was promised, or it cannot be measured on the machine (the reason stands under "where from").
+"""
+
+
+def page(files: list[Path]) -> str:
+    """The whole page from files of records."""
+    parts = [HEAD]
+    rows = [row for path in files for row in read_records(path)]
+    for run, group in groupby(rows, key=lambda row: split_source(row.source)[1]):
+        command, _, machine = run.partition(" on ")
+        parts.append(f"## `{command}`\n\n{machine}\n\n{table(list(group))}")
+    return "\n".join(parts)
+
+
+def table(rows: list[Record]) -> str:
+    """Rows as a Markdown table."""
+    lines = ["| figure | value | error | target | holds | where from |", "|---|--:|--:|--:|---|---|"]
+    for row in rows:
+        error = figure(row.error, row.error_unit)
+        target = f"{row.target} {row.unit}".strip() if row.target else "-"
+        cells = (row.name, figure(row.value, row.unit), error, target, verdict(row), split_source(row.source)[0] or "-")
+        lines.append("| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    out = DOCS / "benchmarks.md"
+    out.write_text(page(sorted((DOCS / "figures").glob("*.json"))))
+    print(out)
