@@ -95,6 +95,18 @@ def test_learned_look_shifts_the_logit_the_logarithm_and_the_colour():
     assert torch.equal(learned(look).collided.rgb, look.collided.rgb)
 
 
+def test_growing_thins_a_flake_as_its_matter_spreads():
+    """Faint matter: opacity times area stays, while the size is learned and the opacity is not."""
+    faint, learned = looks(40), LearnedLook()
+    faint.active.opacity.fill_(1e-3)
+    with torch.no_grad():
+        learned.active[1:4] = 0.4
+    grown = learned(faint).active
+    area = (grown.scales / faint.active.scales).prod(dim=1) ** (2 / 3)
+    assert (area > 1.5).all()
+    torch.testing.assert_close(grown.opacity * area, faint.active.opacity, rtol=1e-2, atol=0)
+
+
 def test_learned_look_is_bounded_for_any_weights():
     look, learned = looks(40), LearnedLook()
     with torch.no_grad():

@@ -8,6 +8,7 @@ import torch
 from dynamics_particles import falling, rollout
 
 from pgsd_nerfstudio.dynamics import RegularizationWeights, drift, regularization
+from pgsd_nerfstudio.dynamics.look import OPACITY_UNIT
 from pgsd_nerfstudio.dynamics.regularizers import rotation_angle, safe_norm
 
 
@@ -70,6 +71,8 @@ def test_terms_are_means_over_gaussians_and_frames():
                 head.bias[0] = 0.1 if name != "rgb" else -0.2
         assert roll.learned_look is not None
         roll.learned_look.collided[1:4] = torch.tensor([0.0, 0.3, 0.4])
+        # What growing thins is thickened again, so that the size alone is left.
+        roll.learned_look.collided[0] = 2 * 0.7 / 3 / OPACITY_UNIT
     clip = roll.window(10, 5)
     terms = {name: float(value.detach()) for name, value in regularization(clip, roll.learned_look).items()}
     small, large = math.tanh(0.1), math.tanh(0.2)

@@ -17,6 +17,7 @@ from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 LOG_SCALE_BOUND = math.log(8.0)
 LOGIT_BOUND = 6.0
+OPACITY_UNIT, COLOUR_UNIT = 3.0, 2.0  # an optimizer that moves all numbers alike reaches plausible values of each in like time
 
 
 class Change(NamedTuple):
@@ -54,12 +55,15 @@ class LearnedLook(nn.Module):
 
     The paper says that the initial appearance itself is optimized; a shift that all share moves it coherently and with few
     numbers, while the field adds what differs by place and time. Zero, its start, is the initial look bit for bit.
+
+    Size changes at constant matter: a flake twice as wide has a quarter of the odds of being opaque. Otherwise the two hide each
+    other, since what is too faint gains as much light by growing as by thickening, and descent would grow it.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.active = nn.Parameter(torch.zeros(7))
-        """Logit of the opacity, logarithm of the three scales, colour."""
+        """Logit of the opacity, logarithm of the three scales, colour, in the units of OPACITY_UNIT, 1 and COLOUR_UNIT."""
         self.collided = nn.Parameter(torch.zeros(7))
 
     def forward(self, look: InitialLook) -> InitialLook:
@@ -72,10 +76,12 @@ class LearnedLook(nn.Module):
 
 
 def _bounded(raw: Float[Tensor, "7"]) -> Change:
+    log_scale = LOG_SCALE_BOUND * torch.tanh(raw[None, 1:4] / LOG_SCALE_BOUND)
+    logit = OPACITY_UNIT * raw[:1] - 2 * log_scale.mean(dim=1)  # 2: matter on a pixel is opacity times area
     return Change(
-        LOGIT_BOUND * torch.tanh(raw[:1] / LOGIT_BOUND),
-        LOG_SCALE_BOUND * torch.tanh(raw[None, 1:4] / LOG_SCALE_BOUND),
-        torch.tanh(raw[None, 4:]),
+        LOGIT_BOUND * torch.tanh(logit / LOGIT_BOUND),
+        log_scale,
+        torch.tanh(COLOUR_UNIT * raw[None, 4:]),
     )
 
 

@@ -185,8 +185,8 @@ def solid(gaussians: Gaussians) -> Gaussians:
     The expected depth of a trained splat lies behind its surfaces, where a little light leaks through, and before them, where
     faint haze explains reflections. Without Gaussians below an opacity of 0.1, and with the others hardened to
     1 - (1 - opacity)^3 (three of each), light stops at the first surface: on a garden table the spread of depth fell from 2.8
-    to 1.1 cm, and the mesh within 5 cm of it grew from 66 to 91 percent of the pixels. The price: surfaces lie up to a
-    standard deviation of their Gaussians too far out (measured there: 0.5 cm on the table, 3 cm on the ground). More
+    to 1.1 cm, and the mesh within 5 cm of it grew from 66 to 90 percent of the pixels. The price: surfaces lie up to a
+    standard deviation of their Gaussians too far out (measured there: 0.5 cm on the table, 2 to 3 cm on the ground). More
     hardening raises that, less leaves holes.
     """
     kept = gaussians.select(gaussians.opacities > HAZE)

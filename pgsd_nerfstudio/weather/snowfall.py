@@ -46,7 +46,7 @@ SNOWFALL = register(
             ),
         ),
         prompt="Fluffy snowflakes are falling in {scene}, accumulating on surfaces. Photorealistic, high detail",
-        negative_prompt="static, no snow, blurry, distorted, cartoon, low quality",
+        negative_prompt="static, no snow, blurry, distorted, cartoon, low quality, grey, dirty, dark, ugly",
     )
 )
 
