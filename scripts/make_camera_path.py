@@ -26,9 +26,9 @@ class CameraPath:
     """The data that ns-train was given."""
     output: Path = Path("camera_path.json")
     """Where the camera path goes."""
-    width: int = 640
+    width: int = 544
     """Width in pixels."""
-    height: int = 400
+    height: int = 352
     """Height in pixels."""
     seconds: float = 10.0
     """Length of the video; the weather passes from its beginning to its end."""

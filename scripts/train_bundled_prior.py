@@ -14,6 +14,7 @@ import json
 import math
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -52,7 +53,7 @@ class Training:
     """Where clips, checkpoints, pictures and the log go; about 1 GB."""
     output: Path = Path(__file__).parent.parent / "pgsd_nerfstudio" / "guidance" / "bundled"
     """Where the finished prior goes, as a diffusers folder."""
-    courtyard: int = 400
+    courtyard: int = 600
     """Families of clips (one motion in four looks) of the built-in courtyard."""
     collages: int = 500
     """Families of clips in front of random collages."""
@@ -294,9 +295,10 @@ def export(training: Training, log: Log) -> None:
     parameters = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     halves = {name: part.half() for name, part in parts.items()}
     CogVideoXPipeline(tokenizer=model.tokenizer, scheduler=scheduler, **halves).save_pretrained(beside, safe_serialization=True)
-    for file in (beside / "model_index.json", beside / "tokenizer" / "tokenizer_config.json"):
-        # The name that transformers before version 5 knows too.
-        file.write_text(file.read_text().replace("TokenizersBackend", "PreTrainedTokenizerFast"))
+    for file in beside.rglob("*.json"):
+        # The name that transformers before version 5 knows too, and no path of the machine that trained it.
+        text = file.read_text().replace("TokenizersBackend", "PreTrainedTokenizerFast")
+        file.write_text(re.sub(r'\n *"_name_or_path": "[^"]*",', "", text))
     facts = Facts(
         parameters=parameters,
         words=len(vocabulary()),

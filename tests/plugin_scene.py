@@ -1,4 +1,4 @@
-"""A table on a floor in 340 Gaussians, seen by six cameras of 48x32, on disk as users have it; and a run on it in three steps."""
+"""A table on a floor in 340 Gaussians with six views of 48x32, on disk as users have it; and a run on it in three steps."""
 
 import json
 import math
@@ -11,14 +11,14 @@ from plyfile import PlyData, PlyElement
 VIEWS, WIDTH, HEIGHT = 6, 48, 32
 
 
-def write_scene(folder: Path) -> Path:
-    """Write floor.ply with its transforms.json; returns the .ply."""
+def write_scene(folder: Path, table: float = 0.8) -> Path:
+    """Write floor.ply with its transforms.json; returns the .ply. The table stands as high as asked for."""
     floor = [(x, y, 0.0, 0.5) for x in np.linspace(-6, 6, 18) for y in np.linspace(-6, 6, 18)]
-    table = [(x, y, 0.8, 0.25) for x in np.linspace(-0.6, 0.6, 4) for y in np.linspace(-0.6, 0.6, 4)]
+    tiles = [(x, y, table, 0.25) for x in np.linspace(-0.6, 0.6, 4) for y in np.linspace(-0.6, 0.6, 4)]
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
-    rows = np.zeros(len(floor) + len(table), dtype=[(name, "f4") for name in names])
-    for row, (x, y, z, size) in zip(rows, floor + table, strict=True):
+    rows = np.zeros(len(floor) + len(tiles), dtype=[(name, "f4") for name in names])
+    for row, (x, y, z, size) in zip(rows, floor + tiles, strict=True):
         green = 0.5 + 0.3 * math.sin(3 * x + 2 * y)
         row["x"], row["y"], row["z"] = x, y, z
         row["f_dc_0"], row["f_dc_1"], row["f_dc_2"] = (-0.5, green - 0.5, -0.8)

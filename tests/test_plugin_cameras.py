@@ -61,7 +61,9 @@ def test_the_cameras_of_a_run_look_at_its_splat(splatfacto_run: Path, garden_ply
     photographs = {path.name: i for i, path in enumerate(bare.images)}
     same = torch.tensor([photographs[path.name] for path in scene.images])
     # In their own camera's axes both splats are the same, up to the run's scale.
-    size = (scene.gaussians.means[1] - scene.gaussians.means[0]).norm() / (bare.gaussians.means[1] - bare.gaussians.means[0]).norm()
+    size = (scene.gaussians.means[1] - scene.gaussians.means[0]).norm() / (
+        bare.gaussians.means[1] - bare.gaussians.means[0]
+    ).norm()
 
     def seen(which, index: int) -> torch.Tensor:
         viewmat = which.cameras.viewmats[index]

@@ -1,6 +1,5 @@
 """The gradient of a training clip: frame by frame it must be the same as through one graph over everything."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -36,12 +35,17 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     field, look = DynamicsField.for_history(history), LearnedLook()
     with torch.no_grad():
         for parameter in [*field.parameters(), *look.parameters()]:
-            parameter += 0.05 * torch.randn_like(parameter)
+            parameter += 0.01 * torch.randn_like(parameter)
     rollout = Rollout(history, initial_look(effect("snowfall"), history), field, look)
     cameras = interpolate(scene.cameras, 0, 1, FRAMES)
     gradient = torch.randn(FRAMES, 3, cameras.height, cameras.width, generator=torch.Generator().manual_seed(1))
     return SimpleNamespace(
-        stage=stage, history=history, rollout=rollout, cameras=cameras, gradient=gradient, learned=[*field.parameters(), *look.parameters()]
+        stage=stage,
+        history=history,
+        rollout=rollout,
+        cameras=cameras,
+        gradient=gradient,
+        learned=[*field.parameters(), *look.parameters()],
     )
 
 

@@ -1,5 +1,6 @@
 """A run from training to video, through nerfstudio's own classes; trained once, in three steps."""
 
+import importlib
 import json
 import shutil
 from pathlib import Path
@@ -10,7 +11,6 @@ import yaml
 from guidance_tiny import write_tiny
 from plugin_scene import HEIGHT, VIEWS, WIDTH, tiny_config, train, write_scene
 
-from pgsd_nerfstudio.physics import simulate as simulation
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
 
@@ -36,6 +36,7 @@ def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("only training may do this")
 
+    simulation = importlib.import_module("pgsd_nerfstudio.physics.simulate")
     monkeypatch.setattr(simulation, "simulate", forbidden)
     monkeypatch.setattr(simulation, "motion_prior", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.guidance.prior.VideoPrior.load", forbidden)
@@ -56,7 +57,12 @@ def at(pipeline, time: float | None) -> torch.Tensor:
 
 def test_training_leaves_a_config_a_checkpoint_and_the_motion_prior(trained: Path):
     left = {path.relative_to(trained.parent).as_posix() for path in trained.parent.rglob("*") if path.is_file()}
-    assert {"config.yml", "motion_prior.safetensors", "dataparser_transforms.json", "nerfstudio_models/step-000000002.ckpt"} <= left
+    assert {
+        "config.yml",
+        "motion_prior.safetensors",
+        "dataparser_transforms.json",
+        "nerfstudio_models/step-000000002.ckpt",
+    } <= left
     config = yaml.load(trained.read_text(), Loader=yaml.Loader)
     assert (config.clip_frames, config.clip_height, config.clip_width) == (5, 32, 48), "settled defaults are saved"
     assert config.pipeline.options.clip_width == 48
@@ -132,9 +138,17 @@ def test_a_run_without_its_motion_prior_names_the_command_that_makes_it(run: Pat
 
 def test_a_scene_that_changed_since_is_refused(run: Path, tmp_path: Path):
     copy = copied(run, tmp_path)
-    copy.write_text(copy.read_text().replace("metres_per_unit: null", "metres_per_unit: 2.0"))
+    config = yaml.load(copy.read_text(), Loader=yaml.Loader)
+    config.pipeline.options.load_scene = write_scene(tmp_path, table=0.7)
+    copy.write_text(yaml.dump(config))
     with pytest.raises(RunError, match="is not the scene this run was trained on"):
         opened(copy)
+
+
+def test_a_run_keeps_the_metric_frame_it_was_trained_in(run: Path, tmp_path: Path):
+    copy = copied(run, tmp_path)
+    copy.write_text(copy.read_text().replace("metres_per_unit: null", "metres_per_unit: 2.0"))
+    torch.testing.assert_close(at(opened(copy), 1.0), at(opened(run), 1.0))
 
 
 def test_a_checkpoint_that_lacks_a_tensor_is_refused(run: Path, tmp_path: Path):
@@ -159,6 +173,57 @@ def test_the_same_seed_learns_the_same(trained: Path, prior: Path, tmp_path: Pat
     ours, theirs = (torch.load(next(p.parent.glob("nerfstudio_models/*.ckpt")))["pipeline"] for p in (trained, again))
     for key, value in ours.items():
         torch.testing.assert_close(value, theirs[key], atol=1e-5, rtol=1e-4, msg=key)
+
+
+def test_an_interrupted_training_keeps_what_it_has_learned(
+    trained: Path, prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
+
+    step_before = WeatherPipeline.get_train_loss_dict
+
+    def interrupted(self: WeatherPipeline, step: int):
+        if step == 2:
+            raise KeyboardInterrupt
+        return step_before(self, step)
+
+    monkeypatch.setattr(WeatherPipeline, "get_train_loss_dict", interrupted)
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    config = train(tiny_config(scene, prior, tmp_path))
+    assert "--load-dir" in capsys.readouterr().out
+    assert [path.name for path in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000002.ckpt"]
+    opened(config)
+
+
+def test_a_full_disk_is_said_in_a_sentence(prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from pgsd_nerfstudio.physics.history import ParticleHistory
+
+    def full(self: ParticleHistory, path: Path) -> None:
+        raise OSError(f"could not write {path}: No space left on device")
+
+    monkeypatch.setattr(ParticleHistory, "save", full)
+    with pytest.raises(RunError, match=r"could not be made: could not write .*motion_prior\.safetensors: No space left"):
+        train(tiny_config(write_scene(tmp_path), prior, tmp_path))
+
+
+def test_a_prior_that_predicts_nan_skips_its_step_and_is_given_up_after_five(
+    trained: Path, prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from pgsd_nerfstudio.guidance.prior import VideoPrior
+
+    whole, calls = VideoPrior.predict_v, []
+
+    def broken_at_first(self: VideoPrior, noisy: torch.Tensor, timestep: int, text: torch.Tensor) -> torch.Tensor:
+        calls.append(timestep)
+        return whole(self, noisy, timestep, text) * (float("nan") if len(calls) == 1 or forever else 1.0)
+
+    monkeypatch.setattr(VideoPrior, "predict_v", broken_at_first)
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    forever = False
+    opened(train(tiny_config(scene, prior, tmp_path / "once")))
+    forever = True
+    with pytest.raises(RunError, match=r"6 steps in a row gave nothing: .* NaN"):
+        train(tiny_config(scene, prior, tmp_path / "forever", steps=9))
 
 
 def test_weather_shorter_than_a_clip_is_refused(prior: Path, tmp_path: Path):
@@ -212,7 +277,9 @@ def test_ns_render_writes_all_four_kinds_of_video(run: Path, tmp_path: Path):
     frames = {path.name: imageio_ffmpeg.count_frames_and_secs(str(path))[0] for path in tmp_path.glob("*.mp4")}
     assert frames == {"interpolate.mp4": 2 * (VIEWS - 1), "spiral.mp4": 6, "path.mp4": 3}
     DatasetRender(run, tmp_path / "dataset", image_format="png").main()
-    assert len(list((tmp_path / "dataset/test/rgb").iterdir())) == len(list((tmp_path / "dataset/test/gt-rgb").iterdir())) == VIEWS
+    assert (
+        len(list((tmp_path / "dataset/test/rgb").iterdir())) == len(list((tmp_path / "dataset/test/gt-rgb").iterdir())) == VIEWS
+    )
 
 
 def copied(run: Path, tmp_path: Path) -> Path:

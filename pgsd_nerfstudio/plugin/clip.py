@@ -21,7 +21,9 @@ from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-MARGIN = 0.1  # of the image's half extent: so far outside a particle still counts as seen, since its Gaussian has a size
+# By so much a particle may lie outside of the picture and still count as seen:
+SLACK = 0.1  # m, for its size and what it has learned
+BLUR = 3  # pixels, for the rasterizer's blur
 
 
 class Stopwatch:
@@ -55,12 +57,13 @@ def seen_by(stage: Stage, cameras: Cameras, history: ParticleHistory, start: int
 
 def _inside(stage: Stage, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
     viewmat, K = camera.viewmats[0].to(metres), camera.Ks[0].to(metres)
+    slack = SLACK / stage.scene.frame.metres_per_unit
     local = stage.scene.frame.to_scene(metres) @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = local[:, 2].clamp_min(1e-6)
-    x = (K[0, 0] * local[:, 0] / depth + K[0, 2]) / camera.width
-    y = (K[1, 1] * local[:, 1] / depth + K[1, 2]) / camera.height
-    reach = 0.5 + 0.5 * MARGIN
-    return (local[:, 2] > 0) & ((x - 0.5).abs() < reach) & ((y - 0.5).abs() < reach)
+    x, y, z = local.unbind(1)
+    right, left = (camera.width + BLUR - K[0, 2]) / K[0, 0], (-BLUR - K[0, 2]) / K[0, 0]
+    below, above = (camera.height + BLUR - K[1, 2]) / K[1, 1], (-BLUR - K[1, 2]) / K[1, 1]
+    beside = (x > right * z + slack) | (x < left * z - slack) | (y > below * z + slack) | (y < above * z - slack)
+    return (z > -slack) & ~beside
 
 
 def render_clip(

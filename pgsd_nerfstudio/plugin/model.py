@@ -35,6 +35,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import initial_look
 
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
+STRIDE = 8  # frames between kept states: a jump in time, and the start of a training clip, costs 3.5 frames on average
 
 
 @dataclass
@@ -61,8 +62,8 @@ class WeatherModel(SplatfactoModel):
         look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
         self.field = DynamicsField.for_history(self.history)
         self.look = LearnedLook().to(self.history.device)
-        self.rollout = Rollout(self.history, look, self.field, self.look)
-        self.weather = Panel(options.seconds)
+        self.rollout = Rollout(self.history, look, self.field, self.look, stride=STRIDE)
+        self.weather = Panel(self.stage.scene, options.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
         self._untimed = 0

@@ -41,8 +41,8 @@ class WeatherOptions:
     """Length of the weather in seconds."""
     fps: float = 25.0
     """Frames of weather per second, as in the paper's videos."""
-    max_particles: int = 200_000 if CUDA else 20_000
-    """At most this many particles are simulated, each then standing for several; bounds time and memory of every step."""
+    max_particles: int = 100_000 if CUDA else 8_000
+    """At most this many particles are in the air at once, each then standing for several; bounds the time of every step."""
     weather_seed: int = 0
     """Another seed, another snowfall of the same kind. (--machine.seed varies the training only.)"""
     prior: str = "bundled"

@@ -1,4 +1,7 @@
-"""The viewer's knobs: play, snow on and off, size and opacity of the flakes. Nothing here is saved or learned."""
+"""The viewer's knobs: play, snow on and off, size and opacity of the flakes; and where its visitors start from.
+
+Nothing here is saved or learned.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerCheckbox, ViewerControl, ViewerSlider
 from torch import nn
 
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.scene import Scene
 
 TICK = 0.04  # s between looks at the clock; the time shown follows the clock however long a render takes
 
@@ -20,15 +25,16 @@ TICK = 0.04  # s between looks at the clock; the time shown follows the clock ho
 class Panel(nn.Module):
     """Found by the viewer as an attribute of the model; a module only because the viewer descends into modules."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, scene: Scene, seconds: float) -> None:
         super().__init__()
         self.seconds = seconds
+        # Shown in the alphabetical order of their names here.
+        self.play = ViewerButton("Play / pause", self._toggle)
         self.shown = ViewerCheckbox("Weather", True, hint="Off: the frozen scene alone")
         self.size = ViewerSlider("Flake size", 1.0, 0.25, 4.0, 0.05, hint="Times the learned size")
-        self.opacity = ViewerSlider("Flake opacity", 1.0, 0.0, 1.0, 0.05, hint="Times the learned opacity")
         self.speed = ViewerSlider("Speed", 1.0, 0.1, 4.0, 0.1, hint="Seconds of weather per second")
-        self.play = ViewerButton("Play / pause", self._toggle)
-        self.control = ViewerControl()
+        self.visibility = ViewerSlider("Flake opacity", 1.0, 0.0, 1.0, 0.05, hint="Times the learned opacity")
+        self.control = Entrance(scene)
         self._playing = threading.Event()
         self._player: threading.Thread | None = None
 
@@ -36,9 +42,9 @@ class Panel(nn.Module):
         """The weather as the knobs want it; None where it is switched off."""
         if not self.shown.value:
             return None
-        if self.size.value == 1.0 and self.opacity.value == 1.0:
+        if self.size.value == 1.0 and self.visibility.value == 1.0:
             return weather
-        return replace(weather, scales=weather.scales * self.size.value, opacities=weather.opacities * self.opacity.value)
+        return replace(weather, scales=weather.scales * self.size.value, opacities=weather.opacities * self.visibility.value)
 
     def _toggle(self, _: ViewerButton) -> None:
         if self._playing.is_set():
@@ -60,6 +66,33 @@ class Panel(nn.Module):
             last = now
             viewer._trigger_rerender()
         self._playing.clear()
+
+
+class Entrance(ViewerControl):
+    """Visitors start at the first training view instead of in the middle of the scene, with the scene's own up.
+
+    A little before it, since the viewer hangs the view's own picture up there.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def _setup(self, viewer: Any) -> None:
+        super()._setup(viewer)
+        viewer.viser_server.scene.set_up_direction(tuple(self._scene.frame.rotation[2].tolist()))
+        viewer.viser_server.on_client_connect(self._welcome)
+
+    def _welcome(self, client: Any) -> None:
+        from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+        pose = self._scene.cameras.opengl()[0]
+        center, forward = pose[:3, 3], -pose[:3, 2]
+        # Dragging turns about the point in view that is nearest to the middle of the scene.
+        ahead = ((self._scene.frame.origin - center) @ forward).clamp_min(1e-3)
+        past_picture = 3 * self.viewer.config.camera_frustum_scale * forward
+        with client.atomic():
+            client.camera.position = (center * VISER_NERFSTUDIO_SCALE_RATIO + past_picture).numpy()
+            client.camera.look_at = ((center + ahead * forward) * VISER_NERFSTUDIO_SCALE_RATIO + past_picture).numpy()
 
 
 @contextmanager

@@ -88,8 +88,8 @@ class WeatherPipeline(VanillaPipeline):
         self.datamanager = config.datamanager.setup(
             device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
         )
-        stage = self.datamanager.stage
-        history = (stored_motion if prior is None else prepare_motion)(stage, config.options, config.run_folder)
+        found = stored_motion if prior is None else prepare_motion
+        stage, history = found(self.datamanager.stage, config.options, config.run_folder)
         self._model = config.model.setup(
             scene_box=self.datamanager.train_dataset.scene_box,
             num_train_data=len(self.datamanager.train_dataset),
@@ -138,12 +138,14 @@ class WeatherPipeline(VanillaPipeline):
             scale = regularization_scale(options.weights, distilled.loss)
             weights = RegularizationWeights()
             losses = {name: scale * getattr(weights, name) * value for name, value in terms.items()}
+        with torch.no_grad():
+            metres = drift(rolled)
         # The number shown is |L_SDS|, the gradient that of the surrogate.
         losses = {"video": video - video.detach() + distilled.loss, **losses}
         metrics = {
             "sds": distilled.loss,
             "timestep": distilled.timestep,
-            "drift_m": drift(rolled),
+            "drift_m": metres,
             "particles_seen": int(seen.sum()),
             **{f"gradient/{name}": norm for name, norm in norms.items()},
             **{f"seconds/{name}": seconds for name, seconds in watch.seconds.items()},

@@ -51,7 +51,7 @@ know are ignored.
   model to believe words over what it sees.
 - The scheduler is CogVideoX-2B's (v-prediction, zero terminal SNR) without the shift toward noise that large frames
   need.
-
+{notes}
 ## Figures
 
 Guidance from the wrong look toward the curated one, on {held} families held out (other camera paths and backgrounds):
@@ -63,9 +63,9 @@ look, and the mean cosine between the two directions.
 {descent}## What is weak
 
 - It makes no convincing videos of its own.
-- At 96x64 most flakes in the air are smaller than a pixel, where a larger one and a brighter one look alike. Their scale
-  drifts upward even when the curated clip itself is the target (a least-squares fit in the latents does the same);
-  the scale of landed snow, the opacity of flakes and all colours are what it can teach.
+- At 96x64 most flakes in the air are smaller than a pixel, where a larger one and a brighter one look alike; their scale
+  follows only because the plugin changes size at constant matter. Of landed snow it teaches colour and opacity; the size
+  of the patches it hardly moves.
 - Explicit words of a wrong look as the negative prompt drive beyond the curated look. With an empty negative prompt, or
   one that only names flaws ("blurry, distorted, low quality"), guidance fades where the curated look is reached.
 """
@@ -87,6 +87,8 @@ class Facts:
     """Of the denoiser."""
     held: int
     direction: Mapping[int, tuple[float, float]]
+    notes: str = ""
+    """What this training had of its own, as one more item of the list."""
     descent: Mapping[str, Sequence[tuple[int, Mapping[str, float]]]] = field(default_factory=dict)
     """By negative prompt: steps of distillation and the look relative to the curated one; empty where not measured."""
 
@@ -117,6 +119,7 @@ def write_card(path: Path, facts: Facts) -> None:
         psnr=facts.psnr,
         steps=facts.steps,
         held=facts.held,
+        notes=f"- {facts.notes}\n" if facts.notes else "",
         direction=_table(rows),
         descent=_descent(facts.descent),
     )

@@ -47,7 +47,7 @@ def descend(
     folder: Path | str,
     *,
     negative: str,
-    steps: int = 60,
+    steps: int = 40,
     rate: float = 2e-2,
     guidance_scale: float = 100.0,
     max_particles: int = 20_000,

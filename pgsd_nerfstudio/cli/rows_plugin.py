@@ -1,0 +1,117 @@
+"""Figures of the room plugin: what a training step costs, stage by stage, and that its gradient is that of the whole clip."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout
+from pgsd_nerfstudio.physics import Clock, Domain, simulate
+from pgsd_nerfstudio.plugin.clip import seen_by, surrogate
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.stage import Stage, stage_of
+from pgsd_nerfstudio.scene.cameras import interpolate
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather import SNOWFALL, initial_look
+
+FRAMES, WIDTH, HEIGHT = 9, 96, 64
+START = 30
+
+
+def verify(quick: bool) -> list[Record]:
+    """The gradient that is carried back frame by frame, against one graph over the clip."""
+    stage = stage_of(WeatherOptions(load_scene=Path("demo")), "cpu")
+    rollout = _rollout(300 if quick else 2000)
+    return [
+        Record.judged(
+            "gradient of field and look, frame by frame against one graph",
+            _gradient_error(stage, rollout),
+            "relative L2",
+            "<= 1e-4",
+            source=f"demo, {len(rollout.history):,} particles, {FRAMES} frames of {WIDTH}x{HEIGHT}",
+        )
+    ]
+
+
+def bench(quick: bool) -> list[Record]:
+    """Seconds of a training step by stage, as ns-train runs it with its defaults."""
+    try:
+        pipeline = _pipeline()
+    except RunError as error:
+        return [Record("training step", None, "s", source=f"not measurable here: {error}")]
+    stages: dict[str, list[float]] = {}
+    for step in range(1, 3 if quick else 6):
+        for name, seconds in _step(pipeline, step).items():
+            stages.setdefault(name, []).append(seconds)
+    error = _gradient_error(pipeline.model.stage, _rollout(300))
+    options, history = pipeline.config.options, pipeline.model.history
+    source = (
+        f"demo, {len(history):,} particles, {options.clip_frames} frames of {options.clip_width}x{options.clip_height}, "
+        f"{options.prior} prior, median of {len(stages['whole step'])} steps"
+    )
+    paid = {"error": error, "error_unit": "relative L2 of the gradient", "source": source}
+    return [Record(f"training step: {name}", statistics.median(each), "s", **paid) for name, each in stages.items()]
+
+
+def _pipeline() -> Any:
+    """A pipeline under training, as the Trainer makes it, of two seconds of weather."""
+    from torch.amp.grad_scaler import GradScaler
+
+    from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
+
+    torch.manual_seed(0)
+    config = WeatherTrainerConfig(load_scene=Path("demo"), seconds=2.0)
+    device = config.machine.device_type
+    return config.pipeline.setup(device=device, test_mode="val", grad_scaler=GradScaler(device, enabled=False))
+
+
+def _step(pipeline: Any, step: int) -> dict[str, float]:
+    began = time.perf_counter()
+    _, losses, metrics = pipeline.get_train_loss_dict(step)
+    before = time.perf_counter()
+    torch.stack(list(losses.values())).sum().backward()
+    end = time.perf_counter()
+    for parameter in pipeline.parameters():
+        parameter.grad = None
+    stages = {name.removeprefix("seconds/"): float(value) for name, value in metrics.items() if name.startswith("seconds/")}
+    return {**stages, "roll-out, backward": end - before, "whole step": end - began}
+
+
+def _rollout(most: int) -> Rollout:
+    corners = torch.tensor([[-4.0, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]])
+    ground = SurfaceMesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
+    domain = Domain((-3.5, -3.5, -0.3), (3.5, 3.5, 3.0))
+    history = simulate(ground, SNOWFALL, Clock(frames=START + FRAMES), domain, max_particles=most, progress=False)
+    torch.manual_seed(0)
+    field, look = DynamicsField.for_history(history), LearnedLook()
+    with torch.no_grad():
+        for parameter in [*field.parameters(), *look.parameters()]:
+            parameter += 0.01 * torch.randn_like(parameter)
+    return Rollout(history, initial_look(SNOWFALL, history), field, look)
+
+
+def _gradient_error(stage: Stage, rollout: Rollout) -> float:
+    scene = stage.scene
+    cameras = interpolate(scene.cameras, 0, 1, FRAMES).resized(WIDTH, HEIGHT).to(stage.device)
+    seen, background = seen_by(stage, cameras, rollout.history, START), torch.zeros(3)
+    on_clip = torch.randn(FRAMES, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+    assert rollout.learned_look is not None
+    learned = [*rollout.field.parameters(), *rollout.learned_look.parameters()]
+
+    def weather() -> list[Any]:
+        return [scene.frame.gaussians_to_scene(one.gaussians) for one in rollout.window(START, FRAMES, visible=seen)]
+
+    def flat(loss: Tensor) -> Tensor:
+        return torch.cat([g.flatten() for g in torch.autograd.grad(loss, learned, allow_unused=True) if g is not None])
+
+    picture = stage.rasterizer.render(cameras, weather(), background).rgb.permute(0, 3, 1, 2)
+    whole = flat((picture * on_clip).sum())
+    parts = flat(surrogate(stage, cameras, weather(), background, on_clip)[0])
+    return float((whole - parts).norm() / whole.norm())
