@@ -39,6 +39,8 @@ from transformers import T5EncoderModel
 
 Stage = Literal["clips", "encoder", "latents", "denoiser", "decoder", "export", "descent"]
 STAGES: tuple[Stage, ...] = ("clips", "encoder", "latents", "denoiser", "decoder", "export", "descent")
+MADE = {"encoder": "encoder.json", "latents": "latents.safetensors"}
+"""Stages never repeated unasked, and what shows that they are finished; the others see by themselves how far they are."""
 PARALLEL = ("clips", "denoiser")
 HELD_OUT = 12  # families of either kind, whole camera paths, that no training sees
 CHECKPOINT_SECONDS = 180
@@ -65,7 +67,7 @@ class Training:
     workers: int = min(2, os.cpu_count() or 1)
     """Processes of one thread each: on a CPU they waste less time waiting for each other than threads do."""
     stages: tuple[Stage, ...] = STAGES
-    """Which stages to run; those whose result exists are skipped unless named here explicitly."""
+    """Which stages to run. By default all, less what an interrupted run has finished."""
     quick: bool = False
     """A toy of everything: shows that the script works, is of no use as a prior."""
     rank: int = 0
@@ -95,7 +97,10 @@ def main(training: Training) -> None:
     torch.manual_seed(training.seed)
     log = Log(training.work / "log.txt", quiet=training.rank > 0)
     for stage in training.stages:
-        if training.rank == 0 and training.workers > 1 and stage in PARALLEL and "PRIOR_ALONE" not in os.environ:
+        if training.stages == STAGES and stage in MADE and (training.work / MADE[stage]).exists():
+            log(f"{stage}: done before")
+            continue
+        if training.rank == 0 and training.workers > 1 and stage in PARALLEL:
             with_workers(training, stage, log)
         else:
             RUN[stage](training, log)

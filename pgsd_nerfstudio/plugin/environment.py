@@ -31,7 +31,7 @@ def prepare() -> None:
 
 def _allow_numpy_scalars() -> None:
     """torch >= 2.6 refuses the NumPy scalars that the schedulers leave in every checkpoint of nerfstudio 1.1.5."""
-    from numpy.core.multiarray import scalar
+    from numpy.core.multiarray import scalar  # type: ignore[attr-defined]
 
     dtypes = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
     torch.serialization.add_safe_globals([scalar, (scalar, "numpy._core.multiarray.scalar"), *dtypes])

@@ -36,8 +36,8 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
     try:
         surface = surface_of(stage.scene, stage.rasterizer)
         clock = Clock(fps=options.fps, frames=options.frames)
-        how = {"seed": options.weather_seed, "max_particles": options.max_particles}
-        history = motion_prior(stage.scene, surface, options.chosen_effect(), clock, **how)
+        effect, most = options.chosen_effect(), options.max_particles
+        history = motion_prior(stage.scene, surface, effect, clock, seed=options.weather_seed, max_particles=most)
         made_for = {"splat": _splat_key(stage.scene), "frame": _written(stage.scene.frame)}
         history = replace(history, about={**history.about, **made_for})
         if run_folder is not None:

@@ -15,6 +15,8 @@ from pgsd_nerfstudio.plugin.options import WeatherOptions
 class WeatherTrainer(Trainer):
     """Trains one weather on one device."""
 
+    config: Any  # WeatherTrainerConfig, whose module imports this one
+
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
             raise RunError(f"one device trains one weather, found {world_size}; use --machine.num-devices 1")
