@@ -17,7 +17,7 @@ from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 LOG_SCALE_BOUND = math.log(8.0)
 LOGIT_BOUND = 6.0
-OPACITY_UNIT, COLOUR_UNIT = 3.0, 2.0  # an optimizer that moves all numbers alike reaches plausible values of each in like time
+OPACITY_UNIT, COLOUR_UNIT = 3.0, 2.0  # one number moves a look as far as another: an optimizer moves all alike
 
 
 class Change(NamedTuple):
