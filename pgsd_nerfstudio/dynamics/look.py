@@ -56,8 +56,8 @@ class LearnedLook(nn.Module):
     The paper says that the initial appearance itself is optimized; a shift that all share moves it coherently and with few
     numbers, while the field adds what differs by place and time. Zero, its start, is the initial look bit for bit.
 
-    Size changes at constant matter: a flake twice as wide has a quarter of the odds of being opaque. Otherwise the two hide each
-    other, since what is too faint gains as much light by growing as by thickening, and descent would grow it.
+    Size changes at constant matter: a flake twice as wide has a quarter of the odds of being opaque. Otherwise the two hide
+    each other, since what is too faint gains as much light by growing as by thickening, and descent would grow it.
     """
 
     def __init__(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 from rich.console import Console
 from rich.table import Table
 
@@ -12,7 +14,7 @@ from pgsd_nerfstudio.plugin.stage import Stage
 
 
 def print_summary(console: Console, options: WeatherOptions, stage: Stage, history: ParticleHistory, guide: Guide) -> None:
-    """Print the table."""
+    """Print the table and, on a CPU, what the shell should say to OpenMP."""
     scene = stage.scene
     rows = {
         "scene": f"{options.load_scene} ({len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views), {scene.description}",
@@ -32,3 +34,7 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
     for name, value in rows.items():
         table.add_row(name, value)
     console.print(table)
+    if stage.device.type == "cpu" and os.environ.get("OMP_WAIT_POLICY", "").lower() != "passive":
+        console.print(
+            "[yellow]Waiting threads may slow this run several times over: stop it, `export OMP_WAIT_POLICY=passive`, start again.[/]"
+        )
