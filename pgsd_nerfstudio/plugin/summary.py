@@ -36,5 +36,6 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
     console.print(table)
     if stage.device.type == "cpu" and os.environ.get("OMP_WAIT_POLICY", "").lower() != "passive":
         console.print(
-            "[yellow]Waiting threads may slow this run several times over: stop it, `export OMP_WAIT_POLICY=passive`, start again.[/]"
+            "[yellow]Waiting threads may slow this run several times over: stop it, `export OMP_WAIT_POLICY=passive`, "
+            "start again.[/]"
         )
