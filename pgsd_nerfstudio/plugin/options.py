@@ -67,7 +67,7 @@ class WeatherOptions:
     trajectory: Literal["near", "any"] = "near"
     """Camera path of a training clip: from a random training view to one of the six nearest, or to any other, as in the paper
     (whose straight way through a ring of views leads across its middle within a third of a second)."""
-    refresh_every: int = 25
+    refresh_every: int = 50
     """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
     clip_frames: int | None = None
     """Frames of a training clip; by default 9 as in the paper, or what the video prior was made for if that is less."""
