@@ -142,7 +142,7 @@ def _pipeline_row() -> Record:
         return Record(PIPELINE, None, "", source=str(error))
     from diffusers.pipelines.cogvideo.pipeline_cogvideox import CogVideoXPipeline
 
-    pipeline = CogVideoXPipeline.from_pretrained(prior.name, local_files_only=True).to(prior.device)
+    pipeline = CogVideoXPipeline.from_pretrained(prior.name, torch_dtype=prior.dtype, local_files_only=True).to(prior.device)
     pipeline.set_progress_bar_config(disable=True)
     caught: list[tuple[Tensor, int]] = []
 
