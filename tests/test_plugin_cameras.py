@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -71,6 +72,12 @@ def test_the_cameras_of_a_run_look_at_its_splat(splatfacto_run: Path, garden_ply
 
     for index in (0, len(same) // 2):
         torch.testing.assert_close(seen(scene, index), size * seen(bare, int(same[index])), atol=2e-3, rtol=1e-3)
+
+
+def test_after_a_checkpoint_was_read_nerfstudios_own_can_be_loaded_still(splatfacto_run: Path, tmp_path: Path):
+    torch.save({"lr": np.float64(0.25)}, tmp_path / "step.ckpt")
+    open_scene(splatfacto_run)
+    assert torch.load(tmp_path / "step.ckpt")["lr"] == 0.25
 
 
 def test_a_run_whose_photographs_moved_says_so(splatfacto_run: Path, tmp_path: Path):

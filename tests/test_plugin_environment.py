@@ -33,7 +33,7 @@ def test_the_users_own_ffmpeg_is_left_alone(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_checkpoints_with_numpy_scalars_can_be_loaded(tmp_path: Path):
-    environment._allow_numpy_scalars()
+    environment.allow_numpy_scalars()
     torch.save({"lr": np.float64(0.25)}, tmp_path / "step.ckpt")
     assert torch.load(tmp_path / "step.ckpt")["lr"] == 0.25
 

@@ -24,12 +24,12 @@ class RunError(ValueError):
 
 def prepare() -> None:
     """Allow nerfstudio's own checkpoints, offer an ffmpeg, show bad input as a sentence."""
-    _allow_numpy_scalars()
+    allow_numpy_scalars()
     _offer_ffmpeg()
     _show_sentences()
 
 
-def _allow_numpy_scalars() -> None:
+def allow_numpy_scalars() -> None:
     """torch >= 2.6 refuses the NumPy scalars that the schedulers leave in every checkpoint of nerfstudio 1.1.5."""
     from numpy.core.multiarray import scalar  # type: ignore[attr-defined]
 
