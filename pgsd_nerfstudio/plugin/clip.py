@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -83,11 +83,11 @@ def surrogate(
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
     """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians."""
     total = gradient.new_zeros(())
-    squares: dict[str, float] = {f.name: 0.0 for f in fields(Gaussians)}
+    squares: dict[str, float] = {}
     for k, rolled in enumerate(weather):
         if len(rolled) == 0:
             continue
-        names = [f.name for f in fields(Gaussians) if getattr(rolled, f.name).requires_grad]
+        names = [name for name, tensor in rolled.tensors.items() if tensor.requires_grad]
         if not names:
             continue
         leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
@@ -96,5 +96,5 @@ def surrogate(
         for name, on_leaf in zip(names, found, strict=True):
             if on_leaf is not None:
                 total = total + (getattr(rolled, name) * on_leaf).sum()
-                squares[name] += float(on_leaf.square().sum())
+                squares[name] = squares.get(name, 0.0) + float(on_leaf.square().sum())
     return total, {name: square**0.5 for name, square in squares.items()}

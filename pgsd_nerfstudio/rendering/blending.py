@@ -5,6 +5,8 @@ with a tile list each; the two are walked together by depth, which is exactly th
 
 A row of a tile is 16 pixels and every loop over pixels has that constant length: the compiler turns it into one vector
 operation, which is worth more than skipping the pixels that a splat does not reach.
+
+An image here is one array [5, h, w]: light let through, red, green, blue, depth weighted like the colours.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from pgsd_nerfstudio.rendering.compilation import inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
 from pgsd_nerfstudio.rendering.projection import (
     BLUE,
     BOTTOM,
@@ -32,8 +34,11 @@ from pgsd_nerfstudio.rendering.rasterizer import TILE
 
 F = np.float32
 
-# Planes of a tile while it is blended. Transmittance is negative once the pixel is finished or where it lies outside the image.
-LIGHT, R, G, B, Z = 0, 1, 2, 3, 4
+# A tile while it is blended: 16 rows of five times 16 floats, which begin at these places. All of a row lies in one array with
+# constant distances, so that the compiler sees by itself that no two overlap. Light is negative once the pixel is finished or
+# where it lies outside the image.
+LIGHT, R, G, B, Z = 0, 16, 32, 48, 64
+ROW = 80
 
 CHECK_EVERY = 32
 """Splats between two looks whether the whole tile is finished."""
@@ -67,88 +72,93 @@ def row_misses(offset, half_precision, base, cutoff):
 
 
 @kernel()
-def _blend_splat(splat, tile, left, top, max_alpha, min_transmittance):
-    """Add one splat to a tile [5, 16, 16] whose first pixel is (left, top)."""
-    half_precision, shear, half_drop = F(0.5) * splat[PRECISION], splat[SHEAR], F(0.5) * splat[DROP]
-    opacity, cutoff = splat[OPACITY], splat[CUTOFF]
-    red, green, blue, depth = splat[RED], splat[GREEN], splat[BLUE], splat[DEPTH]
-    for row in range(max(int(splat[TOP]) - top, 0), min(int(splat[BOTTOM]) - top, TILE)):
-        dy = F(top + row) + F(0.5) - splat[Y]
+def blend_splat(splats, i, tile, left, top, max_alpha, min_transmittance):
+    """Add one splat to a tile [16, 80] whose first pixel is (left, top)."""
+    half_precision, shear, half_drop = F(0.5) * splats[i, PRECISION], splats[i, SHEAR], F(0.5) * splats[i, DROP]
+    opacity, cutoff = splats[i, OPACITY], splats[i, CUTOFF]
+    red, green, blue, depth = splats[i, RED], splats[i, GREEN], splats[i, BLUE], splats[i, DEPTH]
+    for y in range(max(int(splats[i, TOP]) - top, 0), min(int(splats[i, BOTTOM]) - top, TILE)):
+        dy = F(top + y) + F(0.5) - splats[i, Y]
         base = half_drop * dy * dy
-        offset = F(left) + F(0.5) - splat[X] + shear * dy
+        offset = F(left) + F(0.5) - splats[i, X] + shear * dy
         if row_misses(offset, half_precision, base, cutoff):
             continue
-        light, r, g, b, z = tile[LIGHT, row], tile[R, row], tile[G, row], tile[B, row], tile[Z, row]
+        row = tile[y]
         for x in range(16):
             across = F(np.int32(x)) + offset
             sigma = half_precision * across * across + base
             alpha = min(opacity * falloff(min(sigma, F(80))), max_alpha)
-            before = light[x]
+            before = row[LIGHT + x]
             after = before * (F(1) - alpha)
             touched = (sigma <= cutoff) & (before > F(0))
             finished = after <= min_transmittance
             weight = alpha * before if touched & (not finished) else F(0)
-            r[x] += weight * red
-            g[x] += weight * green
-            b[x] += weight * blue
-            z[x] += weight * depth
-            light[x] = (-before if finished else after) if touched else before
+            row[R + x] += weight * red
+            row[G + x] += weight * green
+            row[B + x] += weight * blue
+            row[Z + x] += weight * depth
+            row[LIGHT + x] = (-before if finished else after) if touched else before
 
 
 @inlined()
-def any_light(light):
+def any_light(tile):
     """Whether a pixel of the tile still takes light."""
     brightest = F(-1)
-    for row in range(TILE):
+    for y in range(TILE):
+        row = tile[y]
         for x in range(16):
-            brightest = max(brightest, light[row, x])
+            brightest = max(brightest, row[LIGHT + x])
     return brightest > F(0)
 
 
 @kernel()
-def _reaches(splat, tile, left, top):
+def _reaches(splats, i, tile, left, top):
     """Whether a splat may still do something to a pixel of the tile; yes when in doubt by a rounding."""
-    half_precision, shear, half_drop = F(0.5) * splat[PRECISION], splat[SHEAR], F(0.5) * splat[DROP]
-    cutoff = splat[CUTOFF] + F(1e-3)
-    for row in range(max(int(splat[TOP]) - top, 0), min(int(splat[BOTTOM]) - top, TILE)):
-        dy = F(top + row) + F(0.5) - splat[Y]
+    half_precision, shear, half_drop = F(0.5) * splats[i, PRECISION], splats[i, SHEAR], F(0.5) * splats[i, DROP]
+    cutoff = splats[i, CUTOFF] + F(1e-3)
+    for y in range(max(int(splats[i, TOP]) - top, 0), min(int(splats[i, BOTTOM]) - top, TILE)):
+        dy = F(top + y) + F(0.5) - splats[i, Y]
         base = half_drop * dy * dy
-        offset = F(left) + F(0.5) - splat[X] + shear * dy
+        offset = F(left) + F(0.5) - splats[i, X] + shear * dy
         if row_misses(offset, half_precision, base, cutoff):
             continue
-        light = tile[LIGHT, row]
+        row = tile[y]
         reached = False
         for x in range(16):
             across = F(np.int32(x)) + offset
-            reached |= (half_precision * across * across + base <= cutoff) & (light[x] > F(0))
+            reached |= (half_precision * across * across + base <= cutoff) & (row[LIGHT + x] > F(0))
         if reached:
             return True
     return False
 
 
 @inlined()
-def _clear(tile, columns, rows):
+def clear_tile(tile, columns, rows):
     """An empty tile of which `columns` x `rows` pixels lie in the image."""
     tile[:] = F(0)
-    tile[LIGHT] = F(-1)
-    for y in range(rows):
-        for x in range(columns):
-            tile[LIGHT, y, x] = F(1)
+    for y in range(TILE):
+        row = tile[y]
+        for x in range(16):
+            row[LIGHT + x] = F(1) if (y < rows) & (x < columns) else F(-1)
 
 
 @inlined()
-def _store(tile, columns, rows, left, top, color, depth, transmittance):
+def store_tile(tile, columns, rows, left, top, image):
+    """Write a tile to its place in the image [5, h, w]."""
     for y in range(rows):
-        for x in range(columns):
-            color[top + y, left + x, 0] = tile[R, y, x]
-            color[top + y, left + x, 1] = tile[G, y, x]
-            color[top + y, left + x, 2] = tile[B, y, x]
-            depth[top + y, left + x] = tile[Z, y, x]
-            transmittance[top + y, left + x] = abs(tile[LIGHT, y, x])
+        row = tile[y]
+        for plane in range(5):
+            target = image[plane, top + y, left : left + columns]
+            if columns == TILE:  # a loop of constant length, as everywhere
+                for x in range(16):
+                    target[x] = abs(row[16 * plane + x]) if plane == 0 else row[16 * plane + x]
+            else:
+                for x in range(columns):
+                    target[x] = abs(row[16 * plane + x]) if plane == 0 else row[16 * plane + x]
 
 
 @parallel_kernel()
-def blend_frozen(frozen, width, height, workers, max_alpha, min_transmittance, color, depth, transmittance, needed):
+def blend_frozen(frozen, width, height, workers, max_alpha, min_transmittance, image, needed):
     """Blend the frozen splats alone, and mark in `needed` [k] which entries did anything.
 
     What does nothing here does nothing either among dynamic splats, which only take light away: such entries (a corner of the
@@ -158,52 +168,52 @@ def blend_frozen(frozen, width, height, workers, max_alpha, min_transmittance, c
     """
     tiles_across = (width + TILE - 1) // TILE
     tiles = tiles_across * ((height + TILE - 1) // TILE)
+    splats, entries = frozen.splats, frozen.entries
     for worker in prange(workers):
-        tile = np.empty((5, TILE, TILE), np.float32)
+        tile = aligned(TILE, ROW)
         for t in range(worker, tiles, workers):
             left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
             columns, rows = min(TILE, width - left), min(TILE, height - top)
-            _clear(tile, columns, rows)
+            clear_tile(tile, columns, rows)
             for k in range(frozen.offsets[t], frozen.offsets[t + 1]):
-                if k % CHECK_EVERY == 0 and not any_light(tile[LIGHT]):
+                if k % CHECK_EVERY == 0 and not any_light(tile):
                     break
-                splat = frozen.splats[frozen.entries[k]]
-                needed[k] = _reaches(splat, tile, left, top)
+                needed[k] = _reaches(splats, entries[k], tile, left, top)
                 if needed[k]:
-                    _blend_splat(splat, tile, left, top, max_alpha, min_transmittance)
-            _store(tile, columns, rows, left, top, color, depth, transmittance)
+                    blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
+            store_tile(tile, columns, rows, left, top, image)
 
 
 @kernel()
 def _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance):
     """Both lists of tile t by depth; at equal depth the frozen splat comes first."""
-    i, i_end = frozen.offsets[t], frozen.offsets[t + 1]
-    j, j_end = dynamic.offsets[t], dynamic.offsets[t + 1]
+    frozen_splats, frozen_entries, i, i_end = frozen.splats, frozen.entries, frozen.offsets[t], frozen.offsets[t + 1]
+    splats, entries, j, j_end = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
     seen = 0
     while i < i_end or j < j_end:
-        if j == j_end or (i < i_end and frozen.splats[frozen.entries[i], DEPTH] <= dynamic.splats[dynamic.entries[j], DEPTH]):
-            _blend_splat(frozen.splats[frozen.entries[i]], tile, left, top, max_alpha, min_transmittance)
+        if j == j_end or (i < i_end and frozen_splats[frozen_entries[i], DEPTH] <= splats[entries[j], DEPTH]):
+            blend_splat(frozen_splats, frozen_entries[i], tile, left, top, max_alpha, min_transmittance)
             i += 1
         else:
-            _blend_splat(dynamic.splats[dynamic.entries[j]], tile, left, top, max_alpha, min_transmittance)
+            blend_splat(splats, entries[j], tile, left, top, max_alpha, min_transmittance)
             j += 1
         seen += 1
-        if seen % CHECK_EVERY == 0 and not any_light(tile[LIGHT]):
+        if seen % CHECK_EVERY == 0 and not any_light(tile):
             break
 
 
 @parallel_kernel()
-def blend_merged(frozen, dynamic, width, height, workers, max_alpha, min_transmittance, color, depth, transmittance):
-    """Blend again those tiles that have dynamic splats; the images come as `blend_frozen` left them."""
+def blend_merged(frozen, dynamic, width, height, workers, max_alpha, min_transmittance, image):
+    """Blend again those tiles that have dynamic splats; the image comes as `blend_frozen` left it."""
     tiles_across = (width + TILE - 1) // TILE
     tiles = tiles_across * ((height + TILE - 1) // TILE)
     for worker in prange(workers):
-        tile = np.empty((5, TILE, TILE), np.float32)
+        tile = aligned(TILE, ROW)
         for t in range(worker, tiles, workers):
             if dynamic.offsets[t] == dynamic.offsets[t + 1]:
                 continue
             left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
             columns, rows = min(TILE, width - left), min(TILE, height - top)
-            _clear(tile, columns, rows)
+            clear_tile(tile, columns, rows)
             _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance)
-            _store(tile, columns, rows, left, top, color, depth, transmittance)
+            store_tile(tile, columns, rows, left, top, image)

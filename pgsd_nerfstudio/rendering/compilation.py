@@ -10,6 +10,7 @@ import threading
 from functools import partial
 
 import numba
+import numpy as np
 
 # GNU OpenMP comes with every numba wheel; TBB is refused beside Open3D's older one, and "workqueue" crashes when two Python
 # threads render at once. Set before the first parallel kernel is compiled.
@@ -29,3 +30,11 @@ inlined = partial(numba.njit, inline="always")
 
 rendering_lock = threading.RLock()
 """Held while kernels run: several Python threads (a viewer beside a training) may render, one at a time."""
+
+
+@kernel()
+def aligned(rows, columns):
+    """Uninitialised float32 [rows, columns] that begins with a cache line: 16 floats then never lie across two of them."""
+    buffer = np.empty(rows * columns + 16, np.float32)
+    start = (-(buffer.ctypes.data // 4)) % 16
+    return buffer[start : start + rows * columns].reshape(rows, columns)

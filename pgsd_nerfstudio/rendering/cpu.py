@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -15,9 +15,12 @@ from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.blending import blend_merged
 from pgsd_nerfstudio.rendering.blending_gradient import blend_backward
 from pgsd_nerfstudio.rendering.compilation import rendering_lock
-from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, splat
-from pgsd_nerfstudio.rendering.projection import GRADIENT_COLUMNS, project_backward
+from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
+from pgsd_nerfstudio.rendering.layers import Layers
+from pgsd_nerfstudio.rendering.layers_walk import blend_layered, blend_layered_backward
+from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
+from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
@@ -29,13 +32,27 @@ class CpuRasterizer:
     the same camera cost little more than what moves. May be called from several Python threads.
     """
 
-    def __init__(self, frozen: Gaussians, *, config: RasterConfig | None = None, cache_bytes: int = 1 << 30) -> None:
+    def __init__(
+        self,
+        frozen: Gaussians,
+        *,
+        config: RasterConfig | None = None,
+        cache_bytes: int = 1 << 30,
+        layers: int | None = None,
+    ) -> None:
+        """`layers`: press the frozen part of each tile into so many layers (see layers.py); None: exact.
+
+        Raises:
+            ValueError: the Gaussians are not on the CPU or not finite, or there is less than one layer.
+        """
         if frozen.device.type != "cpu":
             raise ValueError(f"CpuRasterizer expects Gaussians on the CPU, found them on {frozen.device}; call .to('cpu')")
+        if layers is not None and layers < 1:
+            raise ValueError(f"a tile has at least one layer, or is exact with layers=None; found layers={layers}")
         frozen.check_finite()
         self.frozen = frozen.detach().to(torch.float32)
         self.config = config or RasterConfig()
-        self.views = FrozenViews(self.frozen, self.config, cache_bytes)
+        self.views = FrozenViews(self.frozen, self.config, cache_bytes, layers)
 
     def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
         """As `Rasterizer.render`."""
@@ -46,88 +63,61 @@ class CpuRasterizer:
             with rendering_lock:
                 view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height)
                 if moving is None:
-                    frames.append(tuple(torch.from_numpy(image) for image in frozen[1:]))
+                    frames.append(torch.from_numpy(frozen.image))
                 else:
-                    parameters = (moving.means, moving.quats, moving.scales, moving.opacities, moving.colors)
-                    frames.append(_RenderMerged.apply(*parameters, view, frozen, self.config))
-        color, depth, transmittance = (torch.stack(images) for images in zip(*frames, strict=True))
-        return composite(color, depth, 1.0 - transmittance, background)
+                    colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
+                    tensors = {**moving.tensors, "colors": colors}
+                    frames.append(_RenderMerged.apply(view, frozen, self.config, *tensors.values()))
+        clip = torch.stack(frames)
+        return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], background)
+
+
+class _Walk(NamedTuple):
+    """What the way back needs of a frame."""
+
+    view: View
+    part: Binned | Layers
+    dynamic: Binned
+    ids: np.ndarray
+    """[m] int32: the Gaussian that each splat of `dynamic` is."""
+    limits: tuple[np.float32, np.float32]
+    image: np.ndarray
 
 
 class _RenderMerged(torch.autograd.Function):
-    """One frame: colour [h, w, 3], sum of weights times depth [h, w] and transmittance [h, w]."""
+    """One frame, [5, h, w] as in blending.py."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        view: View,
-        frozen: FrozenView,
-        config: RasterConfig,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        dynamic, ids = splat(Gaussians(means, quats, scales, opacities, colors), view)
-        color, depth, transmittance = frozen.color.copy(), frozen.depth.copy(), frozen.transmittance.copy()
+    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, *tensors: Tensor) -> Tensor:
+        dynamic, ids = splat(Gaussians(*tensors), view)
+        image = frozen.image.copy()
         width, height, workers = view.lens.width, view.lens.height, numba.get_num_threads()
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
-        blend_merged(frozen.binned, dynamic, width, height, workers, *limits, color, depth, transmittance)
-        images = torch.from_numpy(color), torch.from_numpy(depth), torch.from_numpy(transmittance)
-        ctx.save_for_backward(means, quats, scales, opacities, colors, *images)
-        ctx.walk = (view, frozen.binned, dynamic, ids, limits)
-        return images
+        blend = blend_layered if isinstance(frozen.part, Layers) else blend_merged
+        blend(frozen.part, dynamic, width, height, workers, *limits, image)
+        ctx.save_for_backward(*tensors)
+        ctx.walk = _Walk(view, frozen.part, dynamic, ids, limits, image)
+        return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *to_images: Tensor) -> tuple[Tensor | None, ...]:
-        *parameters, color, depth, transmittance = ctx.saved_tensors
+    def backward(ctx: Any, to_image: Tensor) -> tuple[Tensor | None, ...]:
         with rendering_lock:
-            gradients = _gradients(ctx.walk, parameters, (color, depth, transmittance), to_images)
-        typed = (gradient.to(parameter.dtype) for gradient, parameter in zip(gradients, parameters, strict=True))
-        return *typed, None, None, None
+            gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
+        typed = (gradient.to(tensor.dtype) for gradient, tensor in zip(gradients, ctx.saved_tensors, strict=True))
+        return None, None, None, *typed
 
 
-def _gradients(
-    walk: tuple[View, Binned, Binned, np.ndarray, tuple[np.float32, np.float32]],
-    parameters: list[Tensor],
-    images: tuple[Tensor, ...],
-    to_images: tuple[Tensor, ...],
-) -> list[Tensor]:
-    """Gradients of means, quats, scales, opacities and colours."""
-    view, frozen, dynamic, ids, limits = walk
+def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:
+    """Gradients of the tensors of the dynamic Gaussians, in their order."""
+    view, part, dynamic, ids, limits, image = walk
+    lens = view.lens
     to_splats = np.zeros((numba.get_num_threads(), len(ids), GRADIENT_COLUMNS), np.float32)
-    color, depth, transmittance = (float_array(image) for image in images)
-    to_color, to_depth, to_transmittance = (float_array(image) for image in to_images)
-    blend_backward(
-        frozen,
-        dynamic,
-        view.lens.width,
-        view.lens.height,
-        *limits,
-        color,
-        depth,
-        transmittance,
-        to_color,
-        to_depth,
-        to_transmittance,
-        to_splats,
-    )
-    means, quats, scales = (float_array(parameter) for parameter in parameters[:3])
-    to_means, to_quats, to_scales, to_opacities, to_colors = (np.zeros(tuple(p.shape), np.float32) for p in parameters)
-    project_backward(
-        means,
-        quats,
-        scales,
-        view.viewmat,
-        view.lens,
-        ids,
-        to_splats.sum(axis=0),
-        to_means,
-        to_quats,
-        to_scales,
-        to_opacities,
-        to_colors,
-    )
-    return [torch.from_numpy(gradient) for gradient in (to_means, to_quats, to_scales, to_opacities, to_colors)]
+    back = blend_layered_backward if isinstance(part, Layers) else blend_backward
+    back(part, dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats)
+    means, quats, scales = (float_array(tensor) for tensor in (gaussians.means, gaussians.quats, gaussians.scales))
+    motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
+    found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]
+    outputs = found if len(motions) else [*found, np.zeros((0, 3), np.float32)]
+    project_backward(means, quats, scales, motions, view.viewmat, lens, ids, dynamic.splats, totals, *outputs)
+    return [torch.from_numpy(gradient) for gradient in found]

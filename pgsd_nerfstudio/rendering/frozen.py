@@ -1,7 +1,8 @@
 """What can be prepared of a frozen scene for one camera, kept as long as there is room.
 
 Projecting, sorting and binning a large scene costs more than blending a small image of it, and the scene never changes: it is
-done once for each camera. The saving is exact, no picture differs by a bit.
+done once for each camera. The saving is exact, no picture differs by a bit. Pressed into layers on top (layers.py) the scene
+costs hardly more than what moves in it, at a small error.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 
 from pgsd_nerfstudio.rendering.binning import Binned, bin_splats, gather, keep_entries, visible_by_depth
 from pgsd_nerfstudio.rendering.blending import blend_frozen
+from pgsd_nerfstudio.rendering.layers import Layers, press
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
@@ -32,17 +34,14 @@ class View(NamedTuple):
 class FrozenView(NamedTuple):
     """A frozen scene seen by one camera."""
 
-    binned: Binned
-    color: np.ndarray
-    """[h, w, 3] float32, without background."""
-    depth: np.ndarray
-    """[h, w] float32, sum of weights times depth."""
-    transmittance: np.ndarray
-    """[h, w] float32."""
+    part: Binned | Layers
+    """What dynamic splats are merged with."""
+    image: np.ndarray
+    """[5, h, w] float32 as in blending.py: the frozen scene alone, without background."""
 
     @property
     def nbytes(self) -> int:
-        return self.binned.nbytes + self.color.nbytes + self.depth.nbytes + self.transmittance.nbytes
+        return self.part.nbytes + self.image.nbytes
 
 
 def float_array(tensor: torch.Tensor) -> np.ndarray:
@@ -50,18 +49,17 @@ def float_array(tensor: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().to(torch.float32).numpy())
 
 
+def motions_array(gaussians: Gaussians) -> np.ndarray:
+    """Displacements [n, 3] for the kernels, [0, 3] where nothing moves."""
+    moved = gaussians.displacements
+    return np.zeros((0, 3), np.float32) if moved is None else float_array(moved)
+
+
 def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
     """The Gaussians on the image plane of a camera, and which of them each splat is (int32)."""
     splats = np.empty((len(gaussians), COLUMNS), np.float32)
-    project(
-        float_array(gaussians.means),
-        float_array(gaussians.quats),
-        float_array(gaussians.scales),
-        float_array(gaussians.opacities),
-        view.viewmat,
-        view.lens,
-        splats,
-    )
+    shapes = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    project(*(float_array(t) for t in shapes), motions_array(gaussians), view.viewmat, view.lens, splats)
     ids = visible_by_depth(splats)
     visible = gather(splats, ids)
     seen = torch.from_numpy(ids).long()
@@ -73,9 +71,10 @@ def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
 class FrozenViews:
     """A frozen scene for many cameras; the least recently used are forgotten beyond `cache_bytes`."""
 
-    def __init__(self, gaussians: Gaussians, config: RasterConfig, cache_bytes: int) -> None:
+    def __init__(self, gaussians: Gaussians, config: RasterConfig, cache_bytes: int, layers: int | None = None) -> None:
         self._gaussians = gaussians
         self._config = config
+        self._layers = layers
         self._cache_bytes = cache_bytes
         self._bytes = 0
         self._views: OrderedDict[bytes, tuple[View, FrozenView]] = OrderedDict()
@@ -107,22 +106,11 @@ class FrozenViews:
         return view, made
 
     def _make(self, view: View) -> FrozenView:
-        width, height = view.lens.width, view.lens.height
+        width, height, workers = view.lens.width, view.lens.height, numba.get_num_threads()
         binned, _ = splat(self._gaussians, view)
         needed = np.zeros(len(binned.entries), bool)
-        color = np.empty((height, width, 3), np.float32)
-        depth = np.empty((height, width), np.float32)
-        transmittance = np.empty((height, width), np.float32)
-        blend_frozen(
-            binned,
-            width,
-            height,
-            numba.get_num_threads(),
-            np.float32(self._config.max_alpha),
-            np.float32(self._config.min_transmittance),
-            color,
-            depth,
-            transmittance,
-            needed,
-        )
-        return FrozenView(keep_entries(binned, needed), color, depth, transmittance)
+        image = np.empty((5, height, width), np.float32)
+        limits = np.float32(self._config.max_alpha), np.float32(self._config.min_transmittance)
+        blend_frozen(binned, width, height, workers, *limits, image, needed)
+        part = keep_entries(binned, needed)
+        return FrozenView(part if self._layers is None else press(part, width, height, workers, *limits, self._layers), image)

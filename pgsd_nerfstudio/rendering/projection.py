@@ -7,6 +7,10 @@ covariance [[a, b], [b, c]]. Its exponent is kept as a sum of two squares, from 
 
 which stays exact in single precision where the usual A dx^2 + 2 B dx dy + C dy^2 of a long thin splat cancels to noise. The
 projection itself runs in double precision: it is a small part of the time and judged against a float64 reference.
+
+What moves by d while the shutter is open is smeared: a uniform distribution of length |d| has the variance |d|^2 / 12, so the
+motion enters the footprint like a fourth axis of that length. The smeared footprint is larger, its peak lower by
+sqrt(det / det'), so that the light it takes in all stays what it is on average over the exposure.
 """
 
 from __future__ import annotations
@@ -28,10 +32,11 @@ RED, GREEN, BLUE = 6, 7, 8
 DEPTH = 9  # along the camera's z axis, scene units
 CUTOFF = 10  # largest sigma at which alpha reaches min_alpha
 LEFT, RIGHT, TOP, BOTTOM = 11, 12, 13, 14  # pixels that may be touched, end exclusive; LEFT = RIGHT where none
+DIMMING = 15  # what the opacity was multiplied with for the motion
 COLUMNS = 16
 
-# Columns of the gradient of a splat: as above up to DEPTH.
-GRADIENT_COLUMNS = 10
+SMEAR = 1.0 / math.sqrt(12.0)
+"""Standard deviation of a uniform distribution of length one."""
 
 
 class Lens(NamedTuple):
@@ -51,6 +56,7 @@ class Lens(NamedTuple):
     near: float
     far: float
     blur: float
+    square: bool
     radius_sigmas: float
     min_alpha: float
 
@@ -73,13 +79,14 @@ def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
         near=float(config.near),
         far=float(config.far),
         blur=float(config.blur),
+        square=config.footprint == "square",
         radius_sigmas=float(config.radius_sigmas),
         min_alpha=float(config.min_alpha),
     )
 
 
 @kernel()
-def _to_camera(viewmat, mean):
+def to_camera(viewmat, mean):
     """A point in camera axes."""
     x = viewmat[0, 0] * mean[0] + viewmat[0, 1] * mean[1] + viewmat[0, 2] * mean[2] + viewmat[0, 3]
     y = viewmat[1, 0] * mean[0] + viewmat[1, 1] * mean[1] + viewmat[1, 2] * mean[2] + viewmat[1, 3]
@@ -88,7 +95,7 @@ def _to_camera(viewmat, mean):
 
 
 @kernel()
-def _unit_quaternion(quat):
+def unit_quaternion(quat):
     """w, x, y, z of length one, and the factor that made it so."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     scale = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-24))
@@ -96,17 +103,17 @@ def _unit_quaternion(quat):
 
 
 @kernel()
-def _principal_axes(viewmat, w, x, y, z):
+def principal_axes(viewmat, w, x, y, z):
     """The three axes of a Gaussian with this rotation, in camera axes: one triple each."""
     xx, yy, zz = x * x, y * y, z * z
     first = (1 - 2 * (yy + zz), 2 * (x * y + w * z), 2 * (x * z - w * y))
     second = (2 * (x * y - w * z), 1 - 2 * (xx + zz), 2 * (y * z + w * x))
     third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (xx + yy))
-    return _turn(viewmat, first), _turn(viewmat, second), _turn(viewmat, third)
+    return turn(viewmat, first), turn(viewmat, second), turn(viewmat, third)
 
 
 @kernel()
-def _turn(viewmat, v):
+def turn(viewmat, v):
     """A direction in camera axes."""
     return (
         viewmat[0, 0] * v[0] + viewmat[0, 1] * v[1] + viewmat[0, 2] * v[2],
@@ -116,12 +123,18 @@ def _turn(viewmat, v):
 
 
 @kernel()
-def _covariance(axes, scale, bend_x, bend_y, z, lens):
+def on_screen(axis, bend_x, bend_y, z, lens):
+    """A short vector in camera axes as pixels."""
+    return lens.focal_x / z * (axis[0] - bend_x * axis[2]), lens.focal_y / z * (axis[1] - bend_y * axis[2])
+
+
+@kernel()
+def covariance(axes, scale, bend_x, bend_y, z, lens):
     """a, b, c of the footprint, blur included."""
     a, b, c = lens.blur, 0.0, lens.blur
     for k in range(3):
-        u = lens.focal_x / z * (axes[k][0] - bend_x * axes[k][2]) * scale[k]
-        v = lens.focal_y / z * (axes[k][1] - bend_y * axes[k][2]) * scale[k]
+        u, v = on_screen(axes[k], bend_x, bend_y, z, lens)
+        u, v = u * scale[k], v * scale[k]
         a += u * u
         b += u * v
         c += v * v
@@ -145,28 +158,60 @@ def _tiles(low, high, extent):
 
 
 @kernel()
-def _project_one(mean, quat, scale, opacity, viewmat, lens, splat):
+def _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
+    """Whether even a ball of this size would not touch the image; spares the rest for most of what is not seen."""
+    stretch = max(lens.focal_x, lens.focal_y) / z * size
+    variance = lens.blur + stretch * stretch * (1.0 + bend_x * bend_x + bend_y * bend_y)
+    reach = max(lens.radius_sigmas, 3.5) * math.sqrt(variance + 0.1) + 2.0
+    return px + reach < 0.0 or px - reach > lens.width or py + reach < 0.0 or py - reach > lens.height
+
+
+@kernel()
+def _half_sides(a, b, c, cutoff, lens):
+    """Of the rectangle that decides which tiles are entered, whole pixels."""
+    if lens.square:
+        middle = 0.5 * (a + c)
+        radius = math.ceil(lens.radius_sigmas * math.sqrt(middle + math.sqrt(max(0.01, middle * middle - a * c + b * b))))
+        return radius, radius
+    sigmas = min(lens.radius_sigmas, math.sqrt(2.0 * cutoff))
+    return math.ceil(sigmas * math.sqrt(a)), math.ceil(sigmas * math.sqrt(c))
+
+
+@kernel()
+def _project_one(mean, quat, scale, opacity, motion, moves, viewmat, lens, splat):
     """Geometry of one splat [16]."""
     splat[LEFT] = 0.0
     splat[RIGHT] = 0.0
-    x, y, z = _to_camera(viewmat, mean)
+    x, y, z = to_camera(viewmat, mean)
     splat[DEPTH] = z
-    if z < lens.near or z > lens.far or opacity < lens.min_alpha:
+    if not (lens.near <= z <= lens.far) or opacity < lens.min_alpha:
         return
     slope_x, slope_y = x / z, y / z
     bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
-    qw, qx, qy, qz, _ = _unit_quaternion(quat)
-    a, b, c = _covariance(_principal_axes(viewmat, qw, qx, qy, qz), scale, bend_x, bend_y, z, lens)
-    spread = a - b * b / c
-    if not spread > 0.0:
-        return
     px, py = lens.focal_x * slope_x + lens.center_x, lens.focal_y * slope_y + lens.center_y
-    middle = 0.5 * (a + c)
-    radius = math.ceil(lens.radius_sigmas * math.sqrt(middle + math.sqrt(max(0.01, middle * middle - spread * c))))
+    size = max(scale[0], scale[1], scale[2])
+    if moves:
+        size += math.sqrt(motion[0] * motion[0] + motion[1] * motion[1] + motion[2] * motion[2])
+    if _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
+        return
+    qw, qx, qy, qz, _ = unit_quaternion(quat)
+    a, b, c = covariance(principal_axes(viewmat, qw, qx, qy, qz), scale, bend_x, bend_y, z, lens)
+    dimming = 1.0
+    if moves:
+        still = a * c - b * b
+        u, v = on_screen(turn(viewmat, motion), bend_x, bend_y, z, lens)
+        u, v = SMEAR * u, SMEAR * v
+        a, b, c = a + u * u, b + u * v, c + v * v
+        dimming = math.sqrt(still / (a * c - b * b))
+        opacity = opacity * dimming
+    spread = a - b * b / c
+    if not spread > 0.0 or opacity < lens.min_alpha:
+        return
     cutoff = math.log(opacity / lens.min_alpha)
+    half_width, half_height = _half_sides(a, b, c, cutoff, lens)
     reach_x, reach_y = math.sqrt(2.0 * cutoff * a) + 1e-3, math.sqrt(2.0 * cutoff * c) + 1e-3
-    tile_left, tile_right = _tiles(px - radius, px + radius, lens.width)
-    tile_top, tile_bottom = _tiles(py - radius, py + radius, lens.height)
+    tile_left, tile_right = _tiles(px - half_width, px + half_width, lens.width)
+    tile_top, tile_bottom = _tiles(py - half_height, py + half_height, lens.height)
     left, right = _pixels(px - reach_x, px + reach_x, lens.width)
     top, bottom = _pixels(py - reach_y, py + reach_y, lens.height)
     left, right = max(left, tile_left), min(right, tile_right)
@@ -174,96 +219,18 @@ def _project_one(mean, quat, scale, opacity, viewmat, lens, splat):
     if left < right and top < bottom:
         splat[X], splat[Y] = px, py
         splat[PRECISION], splat[SHEAR], splat[DROP] = 1.0 / spread, -b / c, 1.0 / c
-        splat[OPACITY], splat[CUTOFF] = opacity, cutoff
+        splat[OPACITY], splat[CUTOFF], splat[DIMMING] = opacity, cutoff, dimming
         splat[LEFT], splat[RIGHT], splat[TOP], splat[BOTTOM] = left, right, top, bottom
 
 
 @parallel_kernel()
-def project(means, quats, scales, opacities, viewmat, lens, splats):
+def project(means, quats, scales, opacities, motions, viewmat, lens, splats):
     """Fill the geometry of `splats` [n, 16]; colours are left alone.
 
-    means [n, 3], quats [n, 4], scales [n, 3], opacities [n] float32; viewmat [4, 4] float64.
+    means [n, 3], quats [n, 4], scales [n, 3], opacities [n] float32; motions [n, 3], or [0, 3] where nothing moves; viewmat
+    [4, 4] float64.
     """
+    moves = motions.shape[0] > 0
     for i in prange(means.shape[0]):
-        _project_one(means[i], quats[i], scales[i], np.float64(opacities[i]), viewmat, lens, splats[i])
-
-
-@kernel()
-def _project_one_backward(mean, quat, scale, viewmat, lens, gradient, to_mean, to_quat, to_scale):
-    """Gradients of one Gaussian from that of its splat [10]."""
-    x, y, z = _to_camera(viewmat, mean)
-    slope_x, slope_y = x / z, y / z
-    bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
-    qw, qx, qy, qz, quat_scale = _unit_quaternion(quat)
-    axes = _principal_axes(viewmat, qw, qx, qy, qz)
-    a, b, c = _covariance(axes, scale, bend_x, bend_y, z, lens)
-
-    # P, S, Q -> covariance.
-    precision = 1.0 / (a - b * b / c)
-    g_a = -precision * precision * gradient[PRECISION]
-    g_b = -2.0 * b / c * g_a - gradient[SHEAR] / c
-    g_c = (b * b * g_a + b * gradient[SHEAR] - gradient[DROP]) / (c * c)
-
-    # Covariance -> the projected axes u, v -> scales, the axes in the world, and the linearisation.
-    stretch_x, stretch_y = lens.focal_x / z, lens.focal_y / z
-    g_bend_x, g_bend_y, g_z = 0.0, 0.0, np.float64(gradient[DEPTH])
-    g = np.empty((3, 3))  # of the rotation matrix: [world axis, principal axis]
-    for k in range(3):
-        wx, wy, wz = axes[k]
-        u = stretch_x * (wx - bend_x * wz)
-        v = stretch_y * (wy - bend_y * wz)
-        g_u = (2.0 * g_a * u + g_b * v) * scale[k]
-        g_v = (2.0 * g_c * v + g_b * u) * scale[k]
-        to_scale[k] = g_u * u + g_v * v
-        g_u, g_v = g_u * scale[k], g_v * scale[k]
-        g_z -= (g_u * u + g_v * v) / z
-        g_bend_x -= g_u * stretch_x * wz
-        g_bend_y -= g_v * stretch_y * wz
-        g_wx, g_wy = g_u * stretch_x, g_v * stretch_y
-        g_wz = -g_wx * bend_x - g_wy * bend_y
-        for n in range(3):
-            g[n, k] = viewmat[0, n] * g_wx + viewmat[1, n] * g_wy + viewmat[2, n] * g_wz
-
-    # Rotation -> quaternion, without the part along it: only the direction of a quaternion counts.
-    g_w = 2.0 * (qx * (g[2, 1] - g[1, 2]) + qy * (g[0, 2] - g[2, 0]) + qz * (g[1, 0] - g[0, 1]))
-    g_i = 2.0 * (
-        -2.0 * qx * (g[1, 1] + g[2, 2]) + qy * (g[1, 0] + g[0, 1]) + qz * (g[2, 0] + g[0, 2]) + qw * (g[2, 1] - g[1, 2])
-    )
-    g_j = 2.0 * (
-        qx * (g[1, 0] + g[0, 1]) - 2.0 * qy * (g[0, 0] + g[2, 2]) + qz * (g[2, 1] + g[1, 2]) + qw * (g[0, 2] - g[2, 0])
-    )
-    g_k = 2.0 * (
-        qx * (g[2, 0] + g[0, 2]) + qy * (g[2, 1] + g[1, 2]) - 2.0 * qz * (g[0, 0] + g[1, 1]) + qw * (g[1, 0] - g[0, 1])
-    )
-    along = g_w * qw + g_i * qx + g_j * qy + g_k * qz
-    to_quat[0] = (g_w - along * qw) * quat_scale
-    to_quat[1] = (g_i - along * qx) * quat_scale
-    to_quat[2] = (g_j - along * qy) * quat_scale
-    to_quat[3] = (g_k - along * qz) * quat_scale
-
-    # Centre on the screen -> slopes -> camera space -> world. A slope at its limit takes nothing from the linearisation.
-    g_slope_x, g_slope_y = lens.focal_x * gradient[X], lens.focal_y * gradient[Y]
-    if bend_x == slope_x:
-        g_slope_x += g_bend_x
-    if bend_y == slope_y:
-        g_slope_y += g_bend_y
-    g_x, g_y = g_slope_x / z, g_slope_y / z
-    g_z -= g_x * slope_x + g_y * slope_y
-    for n in range(3):
-        to_mean[n] = viewmat[0, n] * g_x + viewmat[1, n] * g_y + viewmat[2, n] * g_z
-
-
-@parallel_kernel()
-def project_backward(
-    means, quats, scales, viewmat, lens, ids, gradients, to_means, to_quats, to_scales, to_opacities, to_colors
-):
-    """Gradients of the Gaussians from those of their splats.
-
-    `gradients` [m, 10] float32 belongs to the Gaussians `ids` [m]; other rows of the last five arrays stay as they are.
-    """
-    for m in prange(ids.shape[0]):
-        i = ids[m]
-        gradient = gradients[m]
-        to_opacities[i] = gradient[OPACITY]
-        to_colors[i, 0], to_colors[i, 1], to_colors[i, 2] = gradient[RED], gradient[GREEN], gradient[BLUE]
-        _project_one_backward(means[i], quats[i], scales[i], viewmat, lens, gradient, to_means[i], to_quats[i], to_scales[i])
+        motion = motions[i] if moves else means[i]
+        _project_one(means[i], quats[i], scales[i], np.float64(opacities[i]), motion, moves, viewmat, lens, splats[i])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -22,7 +22,7 @@ TILE = 16
 """Side of a tile in pixels; gsplat's default, and the width of one vector row in the CPU kernels."""
 
 Dynamic: TypeAlias = Gaussians | Sequence[Gaussians] | None
-"""One set for each camera, one for all, or none. Scene units, plain RGB."""
+"""One set for each camera, one for all, or none. Scene units; plain RGB or spherical harmonics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +35,12 @@ class RasterConfig:
     """Scene units; what lies closer to the camera plane is not drawn, its projection would explode."""
     far: float = 1e10
     """Scene units; beyond is not drawn. Far enough to mean never."""
+    footprint: Literal["square", "rectangle"] = "square"
+    """Which tiles a Gaussian enters. square: those that the square around its longer axis touches, `radius_sigmas` standard
+    deviations to each side (gsplat 1.4). rectangle: those of its bounding box, cut where alpha falls below `min_alpha` if that
+    is nearer (from gsplat 1.5 on; Radl et al., "StopThePop", 2024, section B.2)."""
     radius_sigmas: float = 3.0
-    """Half side of the square that decides which tiles a Gaussian enters, in standard deviations along its longer axis."""
+    """Half side of the footprint in standard deviations; gsplat 3.0 with squares, 3.33 with rectangles."""
     frustum_margin: float = 0.3
     """The projection is linearised no further outside the image than this fraction of its half extent, else it diverges."""
     min_alpha: float = 1.0 / 255.0
@@ -45,6 +49,26 @@ class RasterConfig:
     """No single Gaussian is fully opaque, so that what lies behind keeps a gradient."""
     min_transmittance: float = 1e-4
     """A pixel is finished before the Gaussian that would let less light than this through."""
+
+    @staticmethod
+    def of_gsplat(version: str) -> RasterConfig:
+        """What a release of gsplat does, by its version ("1.4.0", "1.5.3"), or "main" for what came after 1.5.
+
+        Raises:
+            ValueError: the conventions of that version are not known.
+        """
+        for prefix, config in _GSPLAT.items():
+            if version == prefix or version.startswith(prefix + "."):
+                return config
+        raise ValueError(f"the conventions of gsplat {version} are not known; known are those of {', '.join(_GSPLAT)}")
+
+
+# Read in the sources: Projection*.cu for the footprints, Rasterization*.cu and Common.h for the alphas.
+_GSPLAT = {
+    "1.4": RasterConfig(),
+    "1.5": RasterConfig(footprint="rectangle", radius_sigmas=3.33),
+    "main": RasterConfig(footprint="rectangle", radius_sigmas=3.33, max_alpha=0.99),
+}
 
 
 class Rendering(NamedTuple):
@@ -66,10 +90,10 @@ class Rasterizer(Protocol):
     def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
         """The frozen scene merged by depth with the dynamic Gaussians, over the background (black if None).
 
-        Differentiable in the five tensors of the dynamic Gaussians and in the background, not in the frozen scene or cameras.
+        Differentiable in all tensors of the dynamic Gaussians and in the background, not in the frozen scene or cameras.
 
         Raises:
-            ValueError: the number of sets is not that of the cameras, their colours are no plain RGB, or a value is not finite.
+            ValueError: the number of sets is not that of the cameras, or a value is not finite; the message names which.
         """
         ...
 
@@ -83,23 +107,15 @@ def dynamic_per_frame(dynamic: Dynamic, frames: int) -> list[Gaussians | None]:
     if dynamic is None:
         return [None] * frames
     if isinstance(dynamic, Gaussians):
-        _check_dynamic(dynamic)
+        dynamic.check_finite()
         return [dynamic if len(dynamic) else None] * frames
     if len(dynamic) != frames:
         raise ValueError(
             f"expected one dynamic set for each of the {frames} cameras, found {len(dynamic)}; one Gaussians serves all"
         )
     for one in dynamic:
-        _check_dynamic(one)
+        one.check_finite()
     return [one if len(one) else None for one in dynamic]
-
-
-def _check_dynamic(gaussians: Gaussians) -> None:
-    if gaussians.colors.ndim != 2:
-        raise ValueError(
-            f"dynamic Gaussians must carry plain RGB colours [N, 3], found spherical harmonics {tuple(gaussians.colors.shape)}"
-        )
-    gaussians.check_finite()
 
 
 def composite(

@@ -8,7 +8,7 @@ triangle mesh, and depth by casting rays on it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -147,9 +147,9 @@ def _model() -> Model:
     path = cache_dir() / f"demo-{content_key(sources)}.safetensors"
     if (stored := load_tensors(path)) is not None:
         tensors = stored[0]
-        gaussians = Gaussians(*(tensors[f.name] for f in fields(Gaussians)))
-        return Model(gaussians, tensors["vertices"], tensors["triangles"], tensors["foliage"])
+        vertices, triangles, foliage = (tensors.pop(name) for name in ("vertices", "triangles", "foliage"))
+        return Model(Gaussians(**tensors), vertices, triangles, foliage)
     model = build()
-    record = {f.name: getattr(model.gaussians, f.name) for f in fields(Gaussians)}
-    save_tensors(path, {**record, "vertices": model.vertices, "triangles": model.triangles, "foliage": model.foliage})
+    mesh = {"vertices": model.vertices, "triangles": model.triangles, "foliage": model.foliage}
+    save_tensors(path, {**model.gaussians.tensors, **mesh})
     return model

@@ -81,6 +81,7 @@ class Frame:
             means=self.to_scene(gaussians.means),
             quats=roma.quat_xyzw_to_wxyz(quats),
             scales=gaussians.scales / self.metres_per_unit,
+            displacements=None if gaussians.displacements is None else self.vectors_to_scene(gaussians.displacements),
         )
 
 

@@ -7,7 +7,7 @@ scales, opacities in 0..1), not the logarithms and logits that checkpoints store
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,6 +28,9 @@ class Gaussians:
     """Peak opacities, 0..1."""
     colors: Tensor
     """[N, 3] plain RGB in 0..1, or [N, K, 3] spherical harmonics with K = (degree + 1)^2, as in splatfacto."""
+    displacements: Float[Tensor, "n 3"] | None = None
+    """How far each moves while the shutter is open, centred on its mean, same units; None: nothing moves. Rendered as motion
+    blur."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -36,6 +39,8 @@ class Gaussians:
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"Gaussians.{name} must have shape {shape}, found {found}")
+        if self.displacements is not None and tuple(self.displacements.shape) != (n, 3):
+            raise ValueError(f"Gaussians.displacements must have shape {(n, 3)}, found {tuple(self.displacements.shape)}")
         if self.colors.shape[0] != n or self.colors.shape[-1] != 3 or self.colors.ndim not in (2, 3):
             raise ValueError(f"Gaussians.colors must be [{n}, 3] or [{n}, K, 3], found {tuple(self.colors.shape)}")
 
@@ -48,26 +53,31 @@ class Gaussians:
         return None if self.colors.ndim == 2 else round(self.colors.shape[1] ** 0.5) - 1
 
     @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors that are there, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+
+    @property
     def device(self) -> torch.device:
         return self.means.device
 
     def to(self, *args, **kwargs) -> Gaussians:
         """The same Gaussians on another device or in another dtype; arguments as for `Tensor.to`."""
-        return replace(self, **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+        return Gaussians(**{name: tensor.to(*args, **kwargs) for name, tensor in self.tensors.items()})
 
     def detach(self) -> Gaussians:
-        return replace(self, **{f.name: getattr(self, f.name).detach() for f in fields(self)})
+        return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors.items()})
 
     def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> Gaussians:
         """The chosen Gaussians, by mask or by index."""
-        return replace(self, **{f.name: getattr(self, f.name)[which] for f in fields(self)})
+        return Gaussians(**{name: tensor[which] for name, tensor in self.tensors.items()})
 
     def check_finite(self) -> None:
         """Raises ValueError that names the first field with a NaN or infinity."""
-        for f in fields(self):
-            bad = int((~torch.isfinite(getattr(self, f.name))).sum())
-            if bad:
-                raise ValueError(f"{bad} values of the Gaussians' {f.name} are NaN or infinite")
+        for name, tensor in self.tensors.items():
+            # A sum is not finite if a value is not, and reads once; it may overflow, so it only raises the suspicion.
+            if not torch.isfinite(tensor.sum()) and (bad := int((~torch.isfinite(tensor)).sum())):
+                raise ValueError(f"{bad} values of the Gaussians' {name} are NaN or infinite")
 
     @staticmethod
     def empty(device: torch.device | str = "cpu") -> Gaussians:
@@ -77,4 +87,7 @@ class Gaussians:
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     """One set from several of the same colour kind (all RGB, or all of one SH degree)."""
-    return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+    joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians)}
+    still = [moved is None for moved in joined["displacements"]]
+    joined["displacements"] = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]
+    return Gaussians(**{n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)})

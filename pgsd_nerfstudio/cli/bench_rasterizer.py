@@ -1,0 +1,235 @@
+"""What a frame costs on the CPU and how wrong it is: image sizes, frozen and dynamic counts, exact and layered, threads."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numba
+import torch
+from torch import Tensor
+
+from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.yard import middle, view_into_yard, yard, yard_flakes
+from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.rasterizer import Rendering
+from pgsd_nerfstudio.rendering.reference import render_reference
+from pgsd_nerfstudio.rendering.trial import relative_error
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+
+SIZES = ((96, 64), (512, 512), (648, 420))
+FROZEN = (50_000, 150_000, 1_000_000)
+DYNAMIC = (10_000, 50_000, 250_000)
+
+
+def layers_for(width: int, height: int) -> int:
+    """Layers that keep a picture above 48 dB: a small picture has large tiles, in which more happens one behind the other."""
+    return 64 if width * height < 20_000 else 24
+
+
+class Case(NamedTuple):
+    """One picture to be timed."""
+
+    cameras: Cameras
+    frozen: Gaussians
+    dynamic: Gaussians
+
+    @property
+    def label(self) -> str:
+        return f"{self.cameras.width}x{self.cameras.height}, {len(self.frozen) / 1e3:g}k frozen, {len(self.dynamic) / 1e3:g}k dynamic"
+
+
+def bench(quick: bool) -> list[Record]:
+    """All combinations; --quick: one scene in two sizes."""
+    rows = []
+    for width, height in SIZES[:2] if quick else SIZES:
+        cameras = view_into_yard(width, height)
+        for n in (80_000,) if quick else FROZEN:
+            frozen = yard(n)
+            for m in (20_000,) if quick else DYNAMIC:
+                case = Case(cameras, frozen, yard_flakes(m))
+                rows += costs(case, tries=3 if quick else 7, threads=(1,) if quick else (1, 2), window=32)
+    whole = Case(view_into_yard(96, 64) if quick else view_into_yard(648, 420), yard(80_000), yard_flakes(20_000))
+    return [*rows, against_torch(whole), *_compilation(quick)]
+
+
+def costs(case: Case, *, tries: int, threads: tuple[int, ...], window: int) -> list[Record]:
+    """Rows of one case: exact against the float64 reference on the middle `window`, layers against exact on all pixels."""
+    count = layers_for(case.cameras.width, case.cameras.height)
+    exact = CpuRasterizer(case.frozen)
+    layered = CpuRasterizer(case.frozen, layers=count)
+    truth = Case(middle(case.cameras, min(window, case.cameras.height)), case.frozen, case.dynamic)
+    picture, gradient = _errors(truth, CpuRasterizer(case.frozen))
+    source = f"one thread unless said, least of {tries}; error: float64 reference on the middle {window}x{window} pixels"
+    rows = [_first(case, tries, picture, source)]
+    rows += _timed(case, exact, "exact", tries, threads, picture, gradient, source)
+    found, expected = (_rendered_and_gradient(case, rasterizer) for rasterizer in (layered, exact))
+    picture, gradient = psnr(found[0].rgb, expected[0].rgb), relative_error(found[1], expected[1].double())
+    cosine = torch.nn.functional.cosine_similarity(found[1].double(), expected[1].double(), dim=0).item()
+    source = f"one thread unless said, least of {tries}; error: the exact picture, all pixels"
+    rows += _timed(case, layered, f"layers {count}", tries, threads, picture, gradient, source)
+    before, after = (
+        next(row.value for row in rows if row.name.startswith(f"forward+backward, {m}")) for m in ("exact", "layers")
+    )
+    assert before is not None and after is not None
+    where = f"forward+backward, {case.label}"
+    return [
+        *rows,
+        Record(f"layers {count} against exact, {case.label}", before / after, "times faster", picture, "dB", source=where),
+        Record.judged(f"gradient cosine of layers {count}, {case.label}", cosine, "", ">= 0.997", source="all parameters"),
+    ]
+
+
+def _first(case: Case, tries: int, picture: float, source: str) -> Record:
+    alone = least(lambda: CpuRasterizer(case.frozen).render(case.cameras, case.dynamic), min(tries, 3))
+    return Record(f"first picture from a camera, {case.label}", alone, "ms CPU", picture, "dB", source=source)
+
+
+def _timed(
+    case: Case,
+    rasterizer: CpuRasterizer,
+    mode: str,
+    tries: int,
+    threads: tuple[int, ...],
+    picture: float,
+    gradient: float,
+    source: str,
+) -> list[Record]:
+    """Forward, forward+backward, both on several threads, and the memory of the prepared view."""
+    leaf = leaves(case.dynamic)
+
+    def forward() -> object:
+        with torch.no_grad():
+            return rasterizer.render(case.cameras, case.dynamic)
+
+    def both() -> object:
+        return weighted(rasterizer.render(case.cameras, leaf)).backward()
+
+    rows = [
+        Record(f"forward, {mode}, {case.label}", least(forward, tries), "ms CPU", picture, "dB", source=source),
+        Record(f"forward+backward, {mode}, {case.label}", least(both, tries), "ms CPU", gradient, "relative L2", source=source),
+        Record(f"prepared view, {mode}, {case.label}", rasterizer.views.nbytes / 1e6, "MB", source="kept for each camera"),
+    ]
+    if max(threads) > 1:
+        one, several = (least(both, tries, threads=n, wall=True) for n in (1, max(threads)))
+        name = f"{max(threads)} threads against one, {mode}, {case.label}"
+        rows.append(Record(name, one / several, "times faster", gradient, "relative L2", source="wall clock, forward+backward"))
+    return rows
+
+
+def against_torch(case: Case) -> Record:
+    """A vectorised torch rasterizer of the same conventions, forward, beside ours in one run."""
+    exact = CpuRasterizer(case.frozen)
+
+    def peer() -> Rendering:
+        with torch.no_grad():
+            return render_reference(case.cameras, [case.frozen, case.dynamic], dtype=torch.float32)
+
+    theirs, ours = least(peer, 1, warm=False), least(lambda: exact.render(case.cameras, case.dynamic), 5)
+    error = psnr(exact.render(case.cameras, case.dynamic).rgb, peer().rgb)
+    source = f"reference.py in float32, one thread, forward: {theirs:.0f} ms against {ours:.1f} ms"
+    return Record.judged(
+        f"against vectorised torch, {case.label}",
+        theirs / ours,
+        "times faster",
+        ">= 30",
+        error=error,
+        error_unit="dB",
+        source=source,
+    )
+
+
+_FIRST_CALL = """
+import time
+import torch
+from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians
+frozen, dynamic = random_gaussians(50), random_gaussians(20, 1)
+dynamic.means.requires_grad_()
+began = time.perf_counter()
+for layers in (None, 4):
+    CpuRasterizer(frozen, layers=layers).render(random_cameras(1, 32, 32), dynamic).rgb.sum().backward()
+print(time.perf_counter() - began)
+"""
+
+
+def _compilation(quick: bool) -> list[Record]:
+    """Seconds of the first picture and gradient of a process, with an empty cache of kernels and with a full one."""
+    if quick:
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+        seconds = []
+        for _ in range(3):
+            done = subprocess.run(
+                [sys.executable, "-c", _FIRST_CALL], env=environment, capture_output=True, text=True, check=True
+            )
+            seconds.append(float(done.stdout))
+    source = "exact and layers, forward and backward, in a process of its own"
+    return [
+        Record.judged("first call after installation", seconds[0], "s", "<= 25", source=source),
+        Record.judged("first call of a later process", min(seconds[1:]), "s", "<= 1.5", source=source),
+    ]
+
+
+def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """The same with gradients of their own."""
+    return Gaussians(**{name: t.detach().clone().to(dtype).requires_grad_() for name, t in gaussians.tensors.items()})
+
+
+def weighted(clip: Rendering) -> Tensor:
+    """A fixed random weighting of the colours, as a loss on the picture would be."""
+    return (clip.rgb * torch.randn(clip.rgb.shape, generator=torch.Generator().manual_seed(0)).to(clip.rgb)).sum()
+
+
+def _rendered_and_gradient(case: Case, rasterizer: CpuRasterizer | None) -> tuple[Rendering, Tensor]:
+    """Picture and gradient of all parameters as one vector; by the float64 reference where there is no rasterizer."""
+    leaf = leaves(case.dynamic, torch.float32 if rasterizer else torch.float64)
+    clip = rasterizer.render(case.cameras, leaf) if rasterizer else render_reference(case.cameras, [case.frozen, leaf])
+    weighted(clip).backward()
+    vector = torch.cat([tensor.grad.flatten() for tensor in leaf.tensors.values() if tensor.grad is not None])
+    return Rendering(*(image.detach() for image in clip)), vector
+
+
+def _errors(case: Case, rasterizer: CpuRasterizer) -> tuple[float, float]:
+    """PSNR and relative error of the gradient against the reference."""
+    found, expected = _rendered_and_gradient(case, rasterizer), _rendered_and_gradient(case, None)
+    return psnr(found[0].rgb, expected[0].rgb), relative_error(found[1], expected[1])
+
+
+def psnr(found: Tensor, expected: Tensor) -> float:
+    return -10.0 * math.log10(max((found.double() - expected.double()).square().mean().item(), 1e-20))
+
+
+@contextmanager
+def on_threads(count: int) -> Iterator[None]:
+    usual = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(count)
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.set_num_threads(usual[0])
+        numba.set_num_threads(usual[1])
+
+
+def least(work: Callable[[], object], tries: int, *, threads: int = 1, wall: bool = False, warm: bool = True) -> float:
+    """Milliseconds of CPU time, or of the clock: the least of several tries, since what others do on the machine only adds."""
+    clock = time.perf_counter if wall else time.process_time
+    times = []
+    with on_threads(threads):
+        if warm:
+            work()
+        for _ in range(tries):
+            began = clock()
+            work()
+            times.append(clock() - began)
+    return 1e3 * min(times)

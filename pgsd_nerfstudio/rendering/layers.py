@@ -1,0 +1,141 @@
+"""The frozen part of every tile pressed into a few layers, so that a frame costs little more than what moves.
+
+A layer is what some consecutive frozen splats of a tile do together to each of its pixels: a premultiplied colour, a weighted
+depth and the light they let through. Composited one after the other the layers are the frozen picture again, whatever their
+number (Porter & Duff, "Compositing digital images", 1984: "over" is associative). What is lost is only the order against
+dynamic splats that fly inside a layer: those are drawn wholly before or wholly behind it. Layers hold equal shares of the
+blended weight of their tile, so they are thin where much is seen.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from pgsd_nerfstudio.rendering.binning import Binned
+from pgsd_nerfstudio.rendering.blending import LIGHT, ROW, B, G, R, Z, blend_splat, clear_tile
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.projection import DEPTH
+from pgsd_nerfstudio.rendering.rasterizer import TILE
+
+F = np.float32
+
+
+class Layers(NamedTuple):
+    """The frozen splats of one camera as layers of its tiles."""
+
+    offsets: np.ndarray
+    """[tiles + 1] int32: the layers of tile t are offsets[t]:offsets[t + 1], nearest first."""
+    depths: np.ndarray
+    """[n] float32, scene units: half of the layer's weight lies nearer; dynamic splats from here on are behind it."""
+    planes: np.ndarray
+    """[n, 16, 80] float32, rows as in blending.py: light let through, premultiplied colour, and depth weighted alike."""
+
+    @property
+    def nbytes(self) -> int:
+        return self.offsets.nbytes + self.depths.nbytes + self.planes.nbytes
+
+
+@inlined()
+def _light_left(tile):
+    """Sum over a tile of what is left of the light; of finished pixels too."""
+    total = F(0)
+    for y in range(TILE):
+        row = tile[y]
+        for x in range(16):
+            total += abs(row[LIGHT + x])
+    return total
+
+
+@kernel()
+def _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends, depths):
+    """Where the layers of tile t end (entries, exclusive) and their depths; returns how many there are, at most `count`."""
+    splats, entries, first, last = frozen.splats, frozen.entries, frozen.offsets[t], frozen.offsets[t + 1]
+    weights = np.zeros(last - first, np.float32)
+    before = _light_left(tile)
+    total = F(0)
+    for k in range(last - first):
+        blend_splat(splats, entries[first + k], tile, left, top, max_alpha, min_transmittance)
+        after = _light_left(tile)
+        weights[k] = max(before - after, F(0))
+        total += weights[k]
+        before = after
+    layers, begin, behind = 0, 0, F(0)
+    inside = F(0)
+    for k in range(last - first):
+        inside += weights[k]
+        if behind + inside < total * F(layers + 1) / F(count) and k + 1 < last - first:
+            continue
+        # The layer is full: its depth is where half of its weight is reached.
+        half, middle = F(0.5) * inside, begin
+        while middle < k and half > weights[middle]:
+            half -= weights[middle]
+            middle += 1
+        ends[layers] = first + k + 1
+        depths[layers] = splats[entries[first + middle], DEPTH]
+        behind += inside
+        inside = F(0)
+        begin = k + 1
+        layers += 1
+        if layers == count and k + 1 < last - first:  # the rest weighs nothing
+            ends[layers - 1] = last
+            break
+    return layers
+
+
+@parallel_kernel()
+def _split_all(frozen, width, height, workers, max_alpha, min_transmittance, count, numbers, ends, depths):
+    """Numbers [tiles], ends [tiles, count] and depths [tiles, count] of the layers."""
+    tiles_across = (width + TILE - 1) // TILE
+    tiles = tiles_across * ((height + TILE - 1) // TILE)
+    for worker in prange(workers):
+        tile = aligned(TILE, ROW)
+        for t in range(worker, tiles, workers):
+            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
+            clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+            numbers[t] = _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends[t], depths[t])
+
+
+@parallel_kernel()
+def _fill(frozen, width, height, workers, max_alpha, min_transmittance, offsets, ends, planes):
+    """Planes of all layers: what changed in the tile from one end to the next, relative to the light that came in.
+
+    The differences cancel where little light is left, and just there they count for as little: no dynamic splat adds light.
+    """
+    tiles_across = (width + TILE - 1) // TILE
+    tiles = tiles_across * ((height + TILE - 1) // TILE)
+    splats, entries = frozen.splats, frozen.entries
+    for worker in prange(workers):
+        tile = aligned(TILE, ROW)
+        for t in range(worker, tiles, workers):
+            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
+            clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+            k = frozen.offsets[t]
+            for layer in range(offsets[t], offsets[t + 1]):
+                before = tile.copy()
+                while k < ends[t, layer - offsets[t]]:
+                    blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
+                    k += 1
+                for y in range(TILE):
+                    for x in range(TILE):
+                        came = abs(before[y, LIGHT + x])
+                        planes[layer, y, LIGHT + x] = abs(tile[y, LIGHT + x]) / came
+                        for plane in (R, G, B, Z):
+                            planes[layer, y, plane + x] = (tile[y, plane + x] - before[y, plane + x]) / came
+
+
+def press(
+    frozen: Binned, width: int, height: int, workers: int, max_alpha: np.float32, min_transmittance: np.float32, count: int
+) -> Layers:
+    """At most `count` layers for each tile."""
+    tiles = len(frozen.offsets) - 1
+    numbers, ends = np.zeros(tiles, np.int32), np.zeros((tiles, count), np.int32)
+    depths = np.zeros((tiles, count), np.float32)
+    limits = max_alpha, min_transmittance
+    _split_all(frozen, width, height, workers, *limits, count, numbers, ends, depths)
+    offsets = np.concatenate([[0], np.cumsum(numbers)]).astype(np.int32)
+    planes = aligned(offsets[-1] * TILE, ROW).reshape(-1, TILE, ROW)
+    _fill(frozen, width, height, workers, *limits, offsets, ends, planes)
+    return Layers(offsets, depths[np.arange(count) < numbers[:, None]], planes)

@@ -1,0 +1,123 @@
+"""Dynamic splats blended among the layers of a frozen scene, and the way back; as blending.py and blending_gradient.py do it
+among its splats."""
+
+from __future__ import annotations
+
+from numba import prange
+
+from pgsd_nerfstudio.rendering.blending import (
+    CHECK_EVERY,
+    LIGHT,
+    ROW,
+    B,
+    F,
+    G,
+    R,
+    Z,
+    any_light,
+    blend_splat,
+    clear_tile,
+    store_tile,
+)
+from pgsd_nerfstudio.rendering.blending_gradient import BEHIND, SUMS, TO_B, TO_G, TO_R, TO_Z, pass_dynamic, start_tile
+from pgsd_nerfstudio.rendering.blending_gradient import ROW as GRADIENT_ROW
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.projection import DEPTH
+from pgsd_nerfstudio.rendering.rasterizer import TILE
+
+
+@inlined()
+def _blend_layer(planes, k, tile):
+    """Lay one layer [16, 80] behind what is in the tile."""
+    for y in range(TILE):
+        row, own = tile[y], planes[k, y]
+        for x in range(16):
+            before = row[LIGHT + x]
+            light = max(before, F(0))
+            row[R + x] += light * own[R + x]
+            row[G + x] += light * own[G + x]
+            row[B + x] += light * own[B + x]
+            row[Z + x] += light * own[Z + x]
+            row[LIGHT + x] = before * own[LIGHT + x] if before > F(0) else before
+
+
+@kernel()
+def _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance):
+    depths, planes, k, k_end = layers.depths, layers.planes, layers.offsets[t], layers.offsets[t + 1]
+    splats, entries, first, last = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
+    for j in range(first, last):
+        i = entries[j]
+        while k < k_end and depths[k] <= splats[i, DEPTH]:
+            _blend_layer(planes, k, tile)
+            k += 1
+        blend_splat(splats, i, tile, left, top, max_alpha, min_transmittance)
+        if (j - first) % CHECK_EVERY == CHECK_EVERY - 1 and not any_light(tile):
+            return
+    while k < k_end:
+        _blend_layer(planes, k, tile)
+        k += 1
+
+
+@parallel_kernel()
+def blend_layered(layers, dynamic, width, height, workers, max_alpha, min_transmittance, image):
+    """As `blend_merged`, with layers in place of the frozen splats."""
+    tiles_across = (width + TILE - 1) // TILE
+    tiles = tiles_across * ((height + TILE - 1) // TILE)
+    for worker in prange(workers):
+        tile = aligned(TILE, ROW)
+        for t in range(worker, tiles, workers):
+            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+                continue
+            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
+            columns, rows = min(TILE, width - left), min(TILE, height - top)
+            clear_tile(tile, columns, rows)
+            _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance)
+            store_tile(tile, columns, rows, left, top, image)
+
+
+@inlined()
+def _pass_layer(planes, k, tile):
+    """Take a layer off what is behind."""
+    for y in range(TILE):
+        row, own = tile[y], planes[k, y]
+        for x in range(16):
+            before = row[LIGHT + x]
+            worth = (
+                row[TO_R + x] * own[R + x]
+                + row[TO_G + x] * own[G + x]
+                + row[TO_B + x] * own[B + x]
+                + row[TO_Z + x] * own[Z + x]
+            )
+            row[BEHIND + x] -= max(before, F(0)) * worth
+            row[LIGHT + x] = before * own[LIGHT + x] if before > F(0) else before
+
+
+@kernel()
+def _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients):
+    depths, planes, k, k_end = layers.depths, layers.planes, layers.offsets[t], layers.offsets[t + 1]
+    splats, entries, first, last = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
+    for j in range(first, last):
+        i = entries[j]
+        while k < k_end and depths[k] <= splats[i, DEPTH]:
+            _pass_layer(planes, k, tile)
+            k += 1
+        pass_dynamic(splats, i, tile, left, top, max_alpha, min_transmittance, sums, gradients)
+        if (j - first) % CHECK_EVERY == CHECK_EVERY - 1 and not any_light(tile):
+            return
+
+
+@parallel_kernel()
+def blend_layered_backward(layers, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients):
+    """As `blend_backward`, for an image of `blend_layered`."""
+    tiles_across = (width + TILE - 1) // TILE
+    tiles = tiles_across * ((height + TILE - 1) // TILE)
+    workers = gradients.shape[0]
+    for worker in prange(workers):
+        tile, sums = aligned(TILE, GRADIENT_ROW), aligned(1, SUMS)[0]
+        sums[:] = F(0)
+        for t in range(worker, tiles, workers):
+            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+                continue
+            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
+            start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
+            _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients[worker])
