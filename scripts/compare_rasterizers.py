@@ -19,7 +19,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from pgsd_nerfstudio.cli.bench_rasterizer import Case, against_torch, costs, least, leaves, psnr, weighted
+from pgsd_nerfstudio.cli.bench_rasterizer import Case, against_torch, costs, least, leaves, psnr, weights_for
 from pgsd_nerfstudio.cli.records import Record, print_records, write_records
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
@@ -84,8 +84,8 @@ def _all_dynamic(case: Case) -> Gaussians:
 
 def everything(case: Case, tries: int) -> Record:
     """All Gaussians of the scene with gradients, nothing frozen, no flakes."""
-    empty, leaf = CpuRasterizer(Gaussians.empty()), leaves(_all_dynamic(case))
-    value = least(lambda: weighted(empty.render(case.cameras, leaf)).backward(), tries)
+    empty, leaf, weights = CpuRasterizer(Gaussians.empty()), leaves(_all_dynamic(case)), weights_for(case.cameras)
+    value = least(lambda: empty.render(case.cameras, leaf).rgb.backward(weights), tries)
     name = f"forward+backward, all gradients, {case.cameras.width}x{case.cameras.height}, {len(leaf) / 1e3:g}k"
     return Record(name, value, "ms CPU", source="nothing frozen")
 
@@ -93,7 +93,7 @@ def everything(case: Case, tries: int) -> Record:
 def beside(case: Case, peer: ModuleType, tries: int) -> list[Record]:
     """The peer on the same input: all gradients, and the flakes merged with its prepared frozen part."""
     width, height = case.cameras.width, case.cameras.height
-    weights = torch.randn(1, height, width, 3, generator=torch.Generator().manual_seed(0))[0].numpy()
+    weights = weights_for(case.cameras)
     none = np.zeros((height, width), np.float32)
 
     def arrays(gaussians: Gaussians) -> dict[str, Any]:
@@ -108,7 +108,7 @@ def beside(case: Case, peer: ModuleType, tries: int) -> list[Record]:
         splats, boxes = peer.project_np(still)
         offsets, entries = peer.bin_tiles(splats, boxes, width, height)
         rgb, light = peer.forward(splats, boxes, offsets, entries, width, height)
-        peer.backward(still, splats, boxes, offsets, entries, width, height, rgb, light, weights, none)
+        peer.backward(still, splats, boxes, offsets, entries, width, height, rgb, light, weights[0].numpy(), none)
 
     frozen, frozen_boxes = peer.project_np(still)
     frozen_offsets, frozen_entries = peer.bin_tiles(frozen, frozen_boxes, width, height)
@@ -121,18 +121,18 @@ def beside(case: Case, peer: ModuleType, tries: int) -> list[Record]:
         order = np.empty(joint[-1], np.int32)
         peer._merge(splats, frozen_offsets, frozen_entries, offsets, entries, len(frozen), joint, order)
         rgb, light = peer.forward(splats, boxes, joint, order, width, height)
-        peer.backward(moving, splats, boxes, joint, order, width, height, rgb, light, weights, none, g0=len(frozen))
+        peer.backward(moving, splats, boxes, joint, order, width, height, rgb, light, weights[0].numpy(), none, g0=len(frozen))
         return rgb
 
     exact, empty = CpuRasterizer(case.frozen), CpuRasterizer(Gaussians.empty())
     leaf, all_leaf = leaves(case.dynamic), leaves(_all_dynamic(case))
     rows = []
     for name, theirs, ours, target in (
-        ("all gradients", all_gradients, lambda: weighted(empty.render(case.cameras, all_leaf)).backward(), "<= 1"),
+        ("all gradients", all_gradients, lambda: empty.render(case.cameras, all_leaf).rgb.backward(weights), "<= 1"),
         (
             "flakes over the frozen cache, exact",
             merged,
-            lambda: weighted(exact.render(case.cameras, leaf)).backward(),
+            lambda: exact.render(case.cameras, leaf).rgb.backward(weights),
             "<= 0.75",
         ),
     ):

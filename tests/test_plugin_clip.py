@@ -26,7 +26,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A stage with 200 flakes above a floor, and a field that has learned something at random."""
     ply = write_scene(tmp_path_factory.mktemp("scene"))
     scene = open_scene(ply, ply.parent)
-    stage = Stage(scene, choose_rasterizer(scene.gaussians, "cpu"), torch.device("cpu"))
+    rasterizer = choose_rasterizer(scene.gaussians, "cpu")
+    stage = Stage(scene, rasterizer, rasterizer, torch.device("cpu"))
     corners = torch.tensor([[-4.0, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]])
     floor = SurfaceMesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
     domain = Domain((-3.5, -3.5, -0.3), (3.5, 3.5, 2.5))

@@ -87,7 +87,7 @@ def test_dropping_what_opaque_walls_hide_changes_no_bit():
     found = rasterizer.render(cameras, dynamic)
     everything = CpuRasterizer(Gaussians.empty()).render(cameras, concatenate([frozen, dynamic]))
     _, view = rasterizer.views.get(cameras.viewmats[0], cameras.Ks[0], 64, 48)
-    assert len(view.binned.splats) < 0.7 * len(frozen)  # otherwise nothing was dropped
+    assert len(view.part.splats) < 0.7 * len(frozen)  # otherwise nothing was dropped
     assert torch.equal(found.rgb, everything.rgb)
 
 
@@ -204,8 +204,8 @@ def test_wrong_input_is_refused():
     rasterizer, cameras = choose_rasterizer(random_gaussians(5), "cpu"), random_cameras(2, 16, 16)
     with pytest.raises(ValueError, match="2 cameras, found 3"):
         rasterizer.render(cameras, [random_gaussians(5)] * 3)
-    with pytest.raises(ValueError, match="plain RGB"):
-        rasterizer.render(cameras, random_gaussians(5, degree=1))
+    with pytest.raises(ValueError, match="at least one layer"):
+        CpuRasterizer(random_gaussians(5), layers=0)
     cameras.viewmats[1, 0, 0] = float("inf")
     with pytest.raises(ValueError, match="viewmats"):
         rasterizer.render(cameras)

@@ -32,7 +32,7 @@ DYNAMIC = (10_000, 50_000, 250_000)
 
 def layers_for(width: int, height: int) -> int:
     """Layers that keep a picture above 48 dB: a small picture has large tiles, in which more happens one behind the other."""
-    return 64 if width * height < 20_000 else 24
+    return 64 if width * height < 20_000 else 16
 
 
 class Case(NamedTuple):
@@ -44,7 +44,8 @@ class Case(NamedTuple):
 
     @property
     def label(self) -> str:
-        return f"{self.cameras.width}x{self.cameras.height}, {len(self.frozen) / 1e3:g}k frozen, {len(self.dynamic) / 1e3:g}k dynamic"
+        size = f"{self.cameras.width}x{self.cameras.height}"
+        return f"{size}, {len(self.frozen) / 1e3:g}k frozen, {len(self.dynamic) / 1e3:g}k dynamic"
 
 
 def bench(quick: bool) -> list[Record]:
@@ -104,14 +105,14 @@ def _timed(
     source: str,
 ) -> list[Record]:
     """Forward, forward+backward, both on several threads, and the memory of the prepared view."""
-    leaf = leaves(case.dynamic)
+    leaf, weights = leaves(case.dynamic), weights_for(case.cameras)
 
     def forward() -> object:
         with torch.no_grad():
             return rasterizer.render(case.cameras, case.dynamic)
 
     def both() -> object:
-        return weighted(rasterizer.render(case.cameras, leaf)).backward()
+        return rasterizer.render(case.cameras, leaf).rgb.backward(weights)
 
     rows = [
         Record(f"forward, {mode}, {case.label}", least(forward, tries), "ms CPU", picture, "dB", source=source),
@@ -185,16 +186,17 @@ def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussian
     return Gaussians(**{name: t.detach().clone().to(dtype).requires_grad_() for name, t in gaussians.tensors.items()})
 
 
-def weighted(clip: Rendering) -> Tensor:
-    """A fixed random weighting of the colours, as a loss on the picture would be."""
-    return (clip.rgb * torch.randn(clip.rgb.shape, generator=torch.Generator().manual_seed(0)).to(clip.rgb)).sum()
+def weights_for(cameras: Cameras) -> Tensor:
+    """A fixed random gradient of the colours, as a loss on the picture would hand on."""
+    shape = (len(cameras), cameras.height, cameras.width, 3)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(0))
 
 
 def _rendered_and_gradient(case: Case, rasterizer: CpuRasterizer | None) -> tuple[Rendering, Tensor]:
     """Picture and gradient of all parameters as one vector; by the float64 reference where there is no rasterizer."""
     leaf = leaves(case.dynamic, torch.float32 if rasterizer else torch.float64)
     clip = rasterizer.render(case.cameras, leaf) if rasterizer else render_reference(case.cameras, [case.frozen, leaf])
-    weighted(clip).backward()
+    clip.rgb.backward(weights_for(case.cameras).to(clip.rgb))
     vector = torch.cat([tensor.grad.flatten() for tensor in leaf.tensors.values() if tensor.grad is not None])
     return Rendering(*(image.detach() for image in clip)), vector
 

@@ -46,6 +46,8 @@ class Preview:
     """First second to show; by default the last ones are shown, when the most has gathered."""
     intensity: float | None = None
     """Precipitation in mm/h of water (light snow below 1, heavy above 2.5); by default the effect's own."""
+    exposure: float | None = None
+    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default the effect's own."""
     max_particles: int | None = None
     """Most particles in the air at once, each standing for several real ones; by default 20,000, with CUDA 200,000."""
     seed: int = 0
@@ -107,9 +109,11 @@ class Preview:
         from pgsd_nerfstudio.weather import effect
 
         chosen = effect(self.effect)
-        if self.intensity is None:
-            return chosen
-        return dataclasses.replace(chosen, emission=dataclasses.replace(chosen.emission, intensity=self.intensity))
+        if self.intensity is not None:
+            chosen = dataclasses.replace(chosen, emission=dataclasses.replace(chosen.emission, intensity=self.intensity))
+        if self.exposure is not None:
+            chosen = dataclasses.replace(chosen, appearance=dataclasses.replace(chosen.appearance, exposure=self.exposure))
+        return chosen
 
     @property
     def _first(self) -> int:
@@ -146,7 +150,8 @@ class Preview:
         most = self.max_particles or (200_000 if device == "cuda" else MAX_PARTICLES)
         history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=most).to(device)
         # A field that has learned nothing hands on the simulated motion and the initial look, bit for bit.
-        rollout = Rollout(history, initial_look(effect, history, seed=self.seed), DynamicsField.for_history(history))
+        look, field = initial_look(effect, history, seed=self.seed), DynamicsField.for_history(history)
+        rollout = Rollout(history, look, field, exposure=effect.appearance.exposure)
         cameras = cameras.to(device)
 
         def picture(index: int) -> Tensor:

@@ -11,7 +11,7 @@ HALF, TOP = 4.0, 3.0  # m: half the side of the yard, height of its walls
 
 
 def yard(n: int) -> Gaussians:
-    """A floor and four walls of flat Gaussians, SH degree 1, metres, z up; the more there are the smaller, as in real splats."""
+    """A floor and four walls of flat Gaussians, SH degree 1, metres, z up; the more the smaller, as in real splats."""
     generator = torch.Generator().manual_seed(0)
     side = torch.arange(n) % 8  # four parts floor, one part each wall
     u, v = 2 * torch.rand(2, n, generator=generator) - 1

@@ -56,11 +56,16 @@ class Rollout:
         learned_look: LearnedLook | None = None,
         *,
         stride: int = 25,
+        exposure: float = 0.0,
     ) -> None:
-        """`stride` frames lie between kept states; all parts must be on one device."""
+        """`stride` frames lie between kept states; all parts must be on one device.
+
+        With an `exposure` in seconds the Gaussians in the air carry how far the simulation moves them in that time.
+        """
         if stride < 1:
             raise ValueError(f"stride must be at least one frame, got {stride}")
         self.history, self.look, self.field, self.learned_look, self.stride = history, look, field, learned_look, stride
+        self.exposure = exposure
         self._keyframes: dict[int, State] = {}
         self._stamp: tuple[int, ...] = ()
         self._last: State | None = None
@@ -192,9 +197,18 @@ class Rollout:
             looks.scales,
             looks.opacity,
             looks.rgb,
+            self._displacements(state),
         )
         simulated_quats = history.quats[state.active]
         return RolledFrame(state.frame, gaussians, state.active, state.resting, offset, state.quats, simulated_quats, deltas)
+
+    def _displacements(self, state: State) -> Float[Tensor, "k 3"] | None:
+        """Metres while the shutter is open, of all that is rendered; what lies does not move. None where nothing is smeared."""
+        if self.exposure == 0.0:
+            return None
+        per_frame = self.history.displacement_at(state.frame, state.active)
+        moved = per_frame * (self.exposure * self.history.fps)
+        return torch.cat([moved, moved.new_zeros(len(state.resting), 3)])
 
 
 def _fields(look: ParticleLook) -> tuple[Tensor, Tensor, Tensor]:

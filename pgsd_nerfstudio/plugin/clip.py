@@ -71,7 +71,7 @@ def render_clip(
 ) -> Float[Tensor, "t 3 h w"]:
     """The clip in 0..1, without a graph."""
     with torch.no_grad():
-        return stage.rasterizer.render(cameras, weather, background).rgb.permute(0, 3, 1, 2).clamp(0, 1)
+        return stage.clip_rasterizer.render(cameras, weather, background).rgb.permute(0, 3, 1, 2).clamp(0, 1)
 
 
 def surrogate(
@@ -91,7 +91,7 @@ def surrogate(
         if not names:
             continue
         leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
-        picture = stage.rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background).rgb[0]
+        picture = stage.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background).rgb[0]
         found = torch.autograd.grad(picture, list(leaves.values()), gradient[k].permute(1, 2, 0), allow_unused=True)
         for name, on_leaf in zip(names, found, strict=True):
             if on_leaf is not None:

@@ -62,7 +62,8 @@ class WeatherModel(SplatfactoModel):
         look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
         self.field = DynamicsField.for_history(self.history)
         self.look = LearnedLook().to(self.history.device)
-        self.rollout = Rollout(self.history, look, self.field, self.look, stride=STRIDE)
+        exposure = options.chosen_effect().appearance.exposure
+        self.rollout = Rollout(self.history, look, self.field, self.look, stride=STRIDE, exposure=exposure)
         self.weather = Panel(self.stage.scene, options.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None

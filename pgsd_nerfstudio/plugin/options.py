@@ -37,6 +37,9 @@ class WeatherOptions:
     """Which weather."""
     intensity: float | None = None
     """How much falls, in mm/h of liquid water (light snow 1, heavy snow 3); by default what the effect says."""
+    exposure: float | None = None
+    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default what the effect
+    says, which for snow is 0, no motion blur."""
     seconds: float = 10.0
     """Length of the weather in seconds."""
     fps: float = 25.0
@@ -67,6 +70,9 @@ class WeatherOptions:
     trajectory: Literal["near", "any"] = "near"
     """Camera path of a training clip: from a random training view to one of the six nearest, or to any other, as in the paper
     (whose straight way through a ring of views leads across its middle within a third of a second)."""
+    layers: int | None = None
+    """Without a GPU: press the frozen scene behind every 16x16 pixels into so many layers, which makes training frames faster
+    at a small error (64 for 96x64 pixels, 16 for larger ones; the error is printed); by default exact."""
     refresh_every: int = 50
     """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
     clip_frames: int | None = None
@@ -116,13 +122,15 @@ class WeatherOptions:
                 raise RunError(f"--{name} must be positive, got {value}")
         if not 0.0 <= self.export_time <= 1.0:
             raise RunError(f"--export-time must lie in 0-1, got {self.export_time}")
+        if self.layers is not None and (CUDA or self.layers < 1):
+            raise RunError(f"--layers must be at least 1 and is meant for machines without CUDA, got {self.layers}")
         self.chosen_effect()
 
     def chosen_effect(self) -> Effect:
-        """The effect with the chosen intensity.
+        """The effect with the chosen intensity and exposure.
 
         Raises:
-            RunError: there is no such effect, or the intensity is out of its range.
+            RunError: there is no such effect, or a number is out of its range.
         """
         from pgsd_nerfstudio.weather import effect
 
@@ -130,6 +138,8 @@ class WeatherOptions:
             chosen = effect(self.effect)
             if self.intensity is not None:
                 chosen = replace(chosen, emission=replace(chosen.emission, intensity=self.intensity))
+            if self.exposure is not None:
+                chosen = replace(chosen, appearance=replace(chosen.appearance, exposure=self.exposure))
         except ValueError as error:
             raise RunError(str(error)) from error
         return chosen

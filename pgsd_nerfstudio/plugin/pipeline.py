@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,6 +77,7 @@ class WeatherPipeline(VanillaPipeline):
         """
         Pipeline.__init__(self)
         self._skipped = 0
+        self._layers_judged = False
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
         self.guide: Guide | None = None
         prior = None
@@ -107,6 +108,12 @@ class WeatherPipeline(VanillaPipeline):
         """The model; there is no distributed training that would wrap it."""
         return self._model
 
+    def _judge_layers(self, clip: Tensor, exact: Tensor) -> None:
+        """Say once what pressing the frozen scene into layers costs in accuracy, on the first clip of the run."""
+        self._layers_judged = True
+        psnr = -10.0 * float((clip - exact).square().mean().clamp_min(1e-20).log10())
+        console.print(f"layers {self.config.options.layers}: the first clip lies {psnr:.1f} dB from the exact one")
+
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
         """Losses of one clip: score distillation of the video, and what holds motion and look near the simulation.
 
@@ -129,6 +136,8 @@ class WeatherPipeline(VanillaPipeline):
             weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
             clip = render_clip(stage, views, weather, background)
+        if stage.clip_rasterizer is not stage.rasterizer and not self._layers_judged:
+            self._judge_layers(clip, render_clip(replace(stage, clip_rasterizer=stage.rasterizer), views, weather, background))
         with watch("video prior"):
             distilled = self._distilled(clip, step)
         with watch("render, backward"):
@@ -164,6 +173,7 @@ class WeatherPipeline(VanillaPipeline):
             console.print(f"[yellow]step {step} gives no gradient: {error}[/]")
             return DistilledClip(torch.zeros_like(clip), 0.0, 0)
         self._skipped = 0
+        self._layers_judged = False
         return distilled
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:

@@ -20,6 +20,9 @@ class Stage:
 
     scene: Scene
     rasterizer: Rasterizer
+    """Exact; what people look at and what is measured."""
+    clip_rasterizer: Rasterizer
+    """What training clips are rendered with: the same, or with the frozen scene in layers."""
     device: torch.device
 
 
@@ -29,11 +32,16 @@ def stage_of(options: WeatherOptions, device: torch.device | str) -> Stage:
     Raises:
         SceneError: the scene cannot be used.
     """
-    return _stage(options.load_scene, options.data, options.metres_per_unit, options.scene_description, str(device))
+    return _stage(
+        options.load_scene, options.data, options.metres_per_unit, options.scene_description, str(device), options.layers
+    )
 
 
 @lru_cache(maxsize=2)
-def _stage(path: Path, data: Path | None, metres_per_unit: float | None, description: str | None, device: str) -> Stage:
+def _stage(
+    path: Path, data: Path | None, metres_per_unit: float | None, description: str | None, device: str, layers: int | None
+) -> Stage:
     scene = open_scene(path, data, metres_per_unit, description)
-    rasterizer = choose_rasterizer(scene.gaussians.to(device), torch.device(device))
-    return Stage(scene, rasterizer, torch.device(device))
+    frozen = scene.gaussians.to(device)
+    exact = choose_rasterizer(frozen, device)
+    return Stage(scene, exact, exact if layers is None else choose_rasterizer(frozen, device, layers), torch.device(device))

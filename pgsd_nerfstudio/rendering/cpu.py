@@ -54,6 +54,11 @@ class CpuRasterizer:
         self.config = config or RasterConfig()
         self.views = FrozenViews(self.frozen, self.config, cache_bytes, layers)
 
+    @property
+    def memory(self) -> str:
+        """As `Rasterizer.memory`."""
+        return str(self.views)
+
     def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
         """As `Rasterizer.render`."""
         if not (torch.isfinite(cameras.viewmats).all() and torch.isfinite(cameras.Ks).all()):

@@ -62,9 +62,12 @@ def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
     project(*(float_array(t) for t in shapes), motions_array(gaussians), view.viewmat, view.lens, splats)
     ids = visible_by_depth(splats)
     visible = gather(splats, ids)
-    seen = torch.from_numpy(ids).long()
-    colors, means = gaussians.colors.detach()[seen], gaussians.means.detach()[seen]
-    visible[:, RED : BLUE + 1] = view_colors(colors, means, torch.from_numpy(view.viewmat)).numpy()
+    if gaussians.colors.ndim == 2:
+        visible[:, RED : BLUE + 1] = float_array(gaussians.colors)[ids]
+    else:
+        seen = torch.from_numpy(ids).long()
+        colors, means = gaussians.colors.detach()[seen], gaussians.means.detach()[seen]
+        visible[:, RED : BLUE + 1] = view_colors(colors, means, torch.from_numpy(view.viewmat)).numpy()
     return bin_splats(visible, view.lens.width, view.lens.height), ids
 
 
@@ -86,6 +89,11 @@ class FrozenViews:
 
     def __len__(self) -> int:
         return len(self._views)
+
+    def __str__(self) -> str:
+        kind = "exact" if self._layers is None else f"{self._layers} layers"
+        held, allowed = self._bytes / 1e6, self._cache_bytes / 1e6
+        return f"{len(self)} prepared views ({kind}), {held:,.0f} of at most {allowed:,.0f} MB"
 
     def get(self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int) -> tuple[View, FrozenView]:
         """The scene for one camera, made if it is not held."""

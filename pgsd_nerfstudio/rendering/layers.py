@@ -31,11 +31,14 @@ class Layers(NamedTuple):
     depths: np.ndarray
     """[n] float32, scene units: half of the layer's weight lies nearer; dynamic splats from here on are behind it."""
     planes: np.ndarray
-    """[n, 16, 80] float32, rows as in blending.py: light let through, premultiplied colour, and depth weighted alike."""
+    """[n, 16, 80] uint16, rows as in blending.py: light let through, premultiplied colour, and depth weighted alike; in steps
+    of `steps`. Half the bytes of float32, which is what walking layers costs most; the rounding is far below their error."""
+    steps: np.ndarray
+    """[n, 5] float32: what one step of each plane is worth; of light 2^-15, so that one is exact."""
 
     @property
     def nbytes(self) -> int:
-        return self.offsets.nbytes + self.depths.nbytes + self.planes.nbytes
+        return self.offsets.nbytes + self.depths.nbytes + self.planes.nbytes + self.steps.nbytes
 
 
 @inlined()
@@ -99,7 +102,7 @@ def _split_all(frozen, width, height, workers, max_alpha, min_transmittance, cou
 
 
 @parallel_kernel()
-def _fill(frozen, width, height, workers, max_alpha, min_transmittance, offsets, ends, planes):
+def _fill(frozen, width, height, workers, max_alpha, min_transmittance, offsets, ends, planes, steps):
     """Planes of all layers: what changed in the tile from one end to the next, relative to the light that came in.
 
     The differences cancel where little light is left, and just there they count for as little: no dynamic splat adds light.
@@ -108,22 +111,37 @@ def _fill(frozen, width, height, workers, max_alpha, min_transmittance, offsets,
     tiles = tiles_across * ((height + TILE - 1) // TILE)
     splats, entries = frozen.splats, frozen.entries
     for worker in prange(workers):
-        tile = aligned(TILE, ROW)
+        tile, layer = aligned(TILE, ROW), aligned(TILE, ROW)
         for t in range(worker, tiles, workers):
             left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
             clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
             k = frozen.offsets[t]
-            for layer in range(offsets[t], offsets[t + 1]):
+            for n in range(offsets[t], offsets[t + 1]):
                 before = tile.copy()
-                while k < ends[t, layer - offsets[t]]:
+                while k < ends[t, n - offsets[t]]:
                     blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
                     k += 1
                 for y in range(TILE):
                     for x in range(TILE):
                         came = abs(before[y, LIGHT + x])
-                        planes[layer, y, LIGHT + x] = abs(tile[y, LIGHT + x]) / came
+                        layer[y, LIGHT + x] = abs(tile[y, LIGHT + x]) / came
                         for plane in (R, G, B, Z):
-                            planes[layer, y, plane + x] = (tile[y, plane + x] - before[y, plane + x]) / came
+                            layer[y, plane + x] = (tile[y, plane + x] - before[y, plane + x]) / came
+                _quantise(layer, planes[n], steps[n])
+
+
+@kernel()
+def _quantise(layer, planes, steps):
+    """A layer [16, 80] as whole numbers of steps [5]."""
+    for plane in range(5):
+        place, largest = 16 * plane, F(1e-12)
+        for y in range(TILE):
+            for x in range(16):
+                largest = max(largest, layer[y, place + x])
+        steps[plane] = F(2.0**-15) if place == LIGHT else largest / F(65535)
+        for y in range(TILE):
+            for x in range(16):
+                planes[y, place + x] = np.uint16(max(layer[y, place + x], F(0)) / steps[plane] + F(0.5))
 
 
 def press(
@@ -136,6 +154,6 @@ def press(
     limits = max_alpha, min_transmittance
     _split_all(frozen, width, height, workers, *limits, count, numbers, ends, depths)
     offsets = np.concatenate([[0], np.cumsum(numbers)]).astype(np.int32)
-    planes = aligned(offsets[-1] * TILE, ROW).reshape(-1, TILE, ROW)
-    _fill(frozen, width, height, workers, *limits, offsets, ends, planes)
-    return Layers(offsets, depths[np.arange(count) < numbers[:, None]], planes)
+    planes, steps = np.empty((offsets[-1], TILE, ROW), np.uint16), np.empty((offsets[-1], 5), np.float32)
+    _fill(frozen, width, height, workers, *limits, offsets, ends, planes, steps)
+    return Layers(offsets, depths[np.arange(count) < numbers[:, None]], planes, steps)

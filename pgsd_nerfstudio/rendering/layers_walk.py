@@ -27,34 +27,36 @@ from pgsd_nerfstudio.rendering.rasterizer import TILE
 
 
 @inlined()
-def _blend_layer(planes, k, tile):
-    """Lay one layer [16, 80] behind what is in the tile."""
+def _blend_layer(planes, steps, k, tile):
+    """Lay layer k behind what is in the tile."""
+    through, red, green, blue, depth = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3], steps[k, 4]
     for y in range(TILE):
         row, own = tile[y], planes[k, y]
         for x in range(16):
             before = row[LIGHT + x]
             light = max(before, F(0))
-            row[R + x] += light * own[R + x]
-            row[G + x] += light * own[G + x]
-            row[B + x] += light * own[B + x]
-            row[Z + x] += light * own[Z + x]
-            row[LIGHT + x] = before * own[LIGHT + x] if before > F(0) else before
+            row[R + x] += light * (red * F(own[R + x]))
+            row[G + x] += light * (green * F(own[G + x]))
+            row[B + x] += light * (blue * F(own[B + x]))
+            row[Z + x] += light * (depth * F(own[Z + x]))
+            row[LIGHT + x] = before * (through * F(own[LIGHT + x])) if before > F(0) else before
 
 
 @kernel()
 def _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance):
-    depths, planes, k, k_end = layers.depths, layers.planes, layers.offsets[t], layers.offsets[t + 1]
+    depths, planes, steps = layers.depths, layers.planes, layers.steps
+    k, k_end = layers.offsets[t], layers.offsets[t + 1]
     splats, entries, first, last = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
     for j in range(first, last):
         i = entries[j]
         while k < k_end and depths[k] <= splats[i, DEPTH]:
-            _blend_layer(planes, k, tile)
+            _blend_layer(planes, steps, k, tile)
             k += 1
         blend_splat(splats, i, tile, left, top, max_alpha, min_transmittance)
         if (j - first) % CHECK_EVERY == CHECK_EVERY - 1 and not any_light(tile):
             return
     while k < k_end:
-        _blend_layer(planes, k, tile)
+        _blend_layer(planes, steps, k, tile)
         k += 1
 
 
@@ -76,30 +78,32 @@ def blend_layered(layers, dynamic, width, height, workers, max_alpha, min_transm
 
 
 @inlined()
-def _pass_layer(planes, k, tile):
-    """Take a layer off what is behind."""
+def _pass_layer(planes, steps, k, tile):
+    """Take layer k off what is behind."""
+    through, red, green, blue, depth = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3], steps[k, 4]
     for y in range(TILE):
         row, own = tile[y], planes[k, y]
         for x in range(16):
             before = row[LIGHT + x]
             worth = (
-                row[TO_R + x] * own[R + x]
-                + row[TO_G + x] * own[G + x]
-                + row[TO_B + x] * own[B + x]
-                + row[TO_Z + x] * own[Z + x]
+                row[TO_R + x] * (red * F(own[R + x]))
+                + row[TO_G + x] * (green * F(own[G + x]))
+                + row[TO_B + x] * (blue * F(own[B + x]))
+                + row[TO_Z + x] * (depth * F(own[Z + x]))
             )
             row[BEHIND + x] -= max(before, F(0)) * worth
-            row[LIGHT + x] = before * own[LIGHT + x] if before > F(0) else before
+            row[LIGHT + x] = before * (through * F(own[LIGHT + x])) if before > F(0) else before
 
 
 @kernel()
 def _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients):
-    depths, planes, k, k_end = layers.depths, layers.planes, layers.offsets[t], layers.offsets[t + 1]
+    depths, planes, steps = layers.depths, layers.planes, layers.steps
+    k, k_end = layers.offsets[t], layers.offsets[t + 1]
     splats, entries, first, last = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
     for j in range(first, last):
         i = entries[j]
         while k < k_end and depths[k] <= splats[i, DEPTH]:
-            _pass_layer(planes, k, tile)
+            _pass_layer(planes, steps, k, tile)
             k += 1
         pass_dynamic(splats, i, tile, left, top, max_alpha, min_transmittance, sums, gradients)
         if (j - first) % CHECK_EVERY == CHECK_EVERY - 1 and not any_light(tile):

@@ -85,24 +85,24 @@ def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
     )
 
 
-@kernel()
-def to_camera(viewmat, mean):
+@kernel(forceinline=True)
+def to_camera(viewmat, means, i):
     """A point in camera axes."""
-    x = viewmat[0, 0] * mean[0] + viewmat[0, 1] * mean[1] + viewmat[0, 2] * mean[2] + viewmat[0, 3]
-    y = viewmat[1, 0] * mean[0] + viewmat[1, 1] * mean[1] + viewmat[1, 2] * mean[2] + viewmat[1, 3]
-    z = viewmat[2, 0] * mean[0] + viewmat[2, 1] * mean[1] + viewmat[2, 2] * mean[2] + viewmat[2, 3]
+    x = viewmat[0, 0] * means[i, 0] + viewmat[0, 1] * means[i, 1] + viewmat[0, 2] * means[i, 2] + viewmat[0, 3]
+    y = viewmat[1, 0] * means[i, 0] + viewmat[1, 1] * means[i, 1] + viewmat[1, 2] * means[i, 2] + viewmat[1, 3]
+    z = viewmat[2, 0] * means[i, 0] + viewmat[2, 1] * means[i, 1] + viewmat[2, 2] * means[i, 2] + viewmat[2, 3]
     return x, y, z
 
 
-@kernel()
-def unit_quaternion(quat):
+@kernel(forceinline=True)
+def unit_quaternion(quats, i):
     """w, x, y, z of length one, and the factor that made it so."""
-    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     scale = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-24))
     return w * scale, x * scale, y * scale, z * scale, scale
 
 
-@kernel()
+@kernel(forceinline=True)
 def principal_axes(viewmat, w, x, y, z):
     """The three axes of a Gaussian with this rotation, in camera axes: one triple each."""
     xx, yy, zz = x * x, y * y, z * z
@@ -112,7 +112,7 @@ def principal_axes(viewmat, w, x, y, z):
     return turn(viewmat, first), turn(viewmat, second), turn(viewmat, third)
 
 
-@kernel()
+@kernel(forceinline=True)
 def turn(viewmat, v):
     """A direction in camera axes."""
     return (
@@ -122,26 +122,26 @@ def turn(viewmat, v):
     )
 
 
-@kernel()
+@kernel(forceinline=True)
 def on_screen(axis, bend_x, bend_y, z, lens):
     """A short vector in camera axes as pixels."""
     return lens.focal_x / z * (axis[0] - bend_x * axis[2]), lens.focal_y / z * (axis[1] - bend_y * axis[2])
 
 
-@kernel()
-def covariance(axes, scale, bend_x, bend_y, z, lens):
+@kernel(forceinline=True)
+def covariance(axes, scales, i, bend_x, bend_y, z, lens):
     """a, b, c of the footprint, blur included."""
-    a, b, c = lens.blur, 0.0, lens.blur
-    for k in range(3):
-        u, v = on_screen(axes[k], bend_x, bend_y, z, lens)
-        u, v = u * scale[k], v * scale[k]
-        a += u * u
-        b += u * v
-        c += v * v
-    return a, b, c
+    u0, v0 = on_screen(axes[0], bend_x, bend_y, z, lens)
+    u1, v1 = on_screen(axes[1], bend_x, bend_y, z, lens)
+    u2, v2 = on_screen(axes[2], bend_x, bend_y, z, lens)
+    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+    u0, u1, u2, v0, v1, v2 = u0 * s0, u1 * s1, u2 * s2, v0 * s0, v1 * s1, v2 * s2
+    a = lens.blur + u0 * u0 + u1 * u1 + u2 * u2
+    c = lens.blur + v0 * v0 + v1 * v1 + v2 * v2
+    return a, u0 * v0 + u1 * v1 + u2 * v2, c
 
 
-@kernel()
+@kernel(forceinline=True)
 def _pixels(low, high, extent):
     """Pixels whose centres lie in [low, high], clipped to the image: first and one past the last."""
     first = min(max(math.ceil(low - 0.5), 0.0), float(extent))
@@ -149,7 +149,7 @@ def _pixels(low, high, extent):
     return first, last
 
 
-@kernel()
+@kernel(forceinline=True)
 def _tiles(low, high, extent):
     """Pixels of the tiles that [low, high] touches, clipped to the image; none if it does not touch the image."""
     if high <= 0.0 or low >= extent:
@@ -157,7 +157,7 @@ def _tiles(low, high, extent):
     return max(math.floor(low / TILE) * TILE, 0.0), min(math.ceil(high / TILE) * TILE, float(extent))
 
 
-@kernel()
+@kernel(forceinline=True)
 def _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
     """Whether even a ball of this size would not touch the image; spares the rest for most of what is not seen."""
     stretch = max(lens.focal_x, lens.focal_y) / z * size
@@ -166,7 +166,7 @@ def _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
     return px + reach < 0.0 or px - reach > lens.width or py + reach < 0.0 or py - reach > lens.height
 
 
-@kernel()
+@kernel(forceinline=True)
 def _half_sides(a, b, c, cutoff, lens):
     """Of the rectangle that decides which tiles are entered, whole pixels."""
     if lens.square:
@@ -177,29 +177,29 @@ def _half_sides(a, b, c, cutoff, lens):
     return math.ceil(sigmas * math.sqrt(a)), math.ceil(sigmas * math.sqrt(c))
 
 
-@kernel()
-def _project_one(mean, quat, scale, opacity, motion, moves, viewmat, lens, splat):
-    """Geometry of one splat [16]."""
-    splat[LEFT] = 0.0
-    splat[RIGHT] = 0.0
-    x, y, z = to_camera(viewmat, mean)
-    splat[DEPTH] = z
+@kernel(forceinline=True)
+def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens, splats):
+    """Geometry of splat i."""
+    splats[i, LEFT] = 0.0
+    splats[i, RIGHT] = 0.0
+    x, y, z = to_camera(viewmat, means, i)
+    splats[i, DEPTH] = z
     if not (lens.near <= z <= lens.far) or opacity < lens.min_alpha:
         return
     slope_x, slope_y = x / z, y / z
     bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
     px, py = lens.focal_x * slope_x + lens.center_x, lens.focal_y * slope_y + lens.center_y
-    size = max(scale[0], scale[1], scale[2])
+    size = max(scales[i, 0], scales[i, 1], scales[i, 2])
     if moves:
-        size += math.sqrt(motion[0] * motion[0] + motion[1] * motion[1] + motion[2] * motion[2])
+        size += math.sqrt(motions[i, 0] ** 2 + motions[i, 1] ** 2 + motions[i, 2] ** 2)
     if _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
         return
-    qw, qx, qy, qz, _ = unit_quaternion(quat)
-    a, b, c = covariance(principal_axes(viewmat, qw, qx, qy, qz), scale, bend_x, bend_y, z, lens)
+    qw, qx, qy, qz, _ = unit_quaternion(quats, i)
+    a, b, c = covariance(principal_axes(viewmat, qw, qx, qy, qz), scales, i, bend_x, bend_y, z, lens)
     dimming = 1.0
     if moves:
         still = a * c - b * b
-        u, v = on_screen(turn(viewmat, motion), bend_x, bend_y, z, lens)
+        u, v = on_screen(turn(viewmat, (motions[i, 0], motions[i, 1], motions[i, 2])), bend_x, bend_y, z, lens)
         u, v = SMEAR * u, SMEAR * v
         a, b, c = a + u * u, b + u * v, c + v * v
         dimming = math.sqrt(still / (a * c - b * b))
@@ -217,10 +217,10 @@ def _project_one(mean, quat, scale, opacity, motion, moves, viewmat, lens, splat
     left, right = max(left, tile_left), min(right, tile_right)
     top, bottom = max(top, tile_top), min(bottom, tile_bottom)
     if left < right and top < bottom:
-        splat[X], splat[Y] = px, py
-        splat[PRECISION], splat[SHEAR], splat[DROP] = 1.0 / spread, -b / c, 1.0 / c
-        splat[OPACITY], splat[CUTOFF], splat[DIMMING] = opacity, cutoff, dimming
-        splat[LEFT], splat[RIGHT], splat[TOP], splat[BOTTOM] = left, right, top, bottom
+        splats[i, X], splats[i, Y] = px, py
+        splats[i, PRECISION], splats[i, SHEAR], splats[i, DROP] = 1.0 / spread, -b / c, 1.0 / c
+        splats[i, OPACITY], splats[i, CUTOFF], splats[i, DIMMING] = opacity, cutoff, dimming
+        splats[i, LEFT], splats[i, RIGHT], splats[i, TOP], splats[i, BOTTOM] = left, right, top, bottom
 
 
 @parallel_kernel()
@@ -232,5 +232,4 @@ def project(means, quats, scales, opacities, motions, viewmat, lens, splats):
     """
     moves = motions.shape[0] > 0
     for i in prange(means.shape[0]):
-        motion = motions[i] if moves else means[i]
-        _project_one(means[i], quats[i], scales[i], np.float64(opacities[i]), motion, moves, viewmat, lens, splats[i])
+        _project_one(i, means, quats, scales, np.float64(opacities[i]), motions, moves, viewmat, lens, splats)

@@ -87,6 +87,11 @@ class Rasterizer(Protocol):
 
     frozen: Gaussians
 
+    @property
+    def memory(self) -> str:
+        """What is kept of the frozen scene for the cameras seen so far, in words."""
+        ...
+
     def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
         """The frozen scene merged by depth with the dynamic Gaussians, over the background (black if None).
 
@@ -130,9 +135,15 @@ def composite(
     return Rendering(color, weighted_depth / accumulation.clamp_min(1e-10), accumulation)
 
 
-def choose_rasterizer(frozen: Gaussians, device: torch.device | str) -> Rasterizer:
-    """The rasterizer for a device: numba on the CPU, gsplat with CUDA; the frozen Gaussians are moved there."""
+def choose_rasterizer(frozen: Gaussians, device: torch.device | str, layers: int | None = None) -> Rasterizer:
+    """The rasterizer for a device: numba on the CPU, gsplat with CUDA; the frozen Gaussians are moved there.
+
+    Raises:
+        ValueError: there is no rasterizer for the device, or `layers` (see CpuRasterizer) are asked of another than the CPU's.
+    """
     kind = torch.device(device).type
+    if layers is not None and kind != "cpu":
+        raise ValueError(f"layers are an option of the rasterizer for the CPU, found layers={layers} on {device}")
     if kind == "cuda":
         from pgsd_nerfstudio.rendering.cuda import GsplatRasterizer
 
@@ -140,5 +151,5 @@ def choose_rasterizer(frozen: Gaussians, device: torch.device | str) -> Rasteriz
     if kind == "cpu":
         from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 
-        return CpuRasterizer(frozen.to("cpu"))
+        return CpuRasterizer(frozen.to("cpu"), layers=layers)
     raise ValueError(f"there are rasterizers for the devices cpu and cuda, found {device}")

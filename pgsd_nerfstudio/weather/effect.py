@@ -109,6 +109,9 @@ class Appearance:
 
     active: StateLook = field(default_factory=StateLook)
     collided: StateLook = field(default_factory=StateLook)
+    exposure: float = 0.0
+    """How long the shutter is open, in seconds: what flies is smeared along its way by speed times exposure. 0 freezes it, as
+    snow is mostly shown; rain and sand show streaks at 1/50 s."""
     accumulation_speedup: float = 800.0
     """Time lapse of the cover: a landed particle stands for this many times the water that it and the real particles it
     represents bring. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours."""
@@ -117,6 +120,10 @@ class Appearance:
     layer_thickness: float = 0.010
     """Thickness in metres of what one particle leaves; its area follows from its volume, so that the cover does not depend on
     how many particles were affordable."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.exposure <= 1.0:
+            raise ValueError(f"exposure must lie in 0-1 s, got {self.exposure:g}; a film camera has about 0.02")
 
 
 @dataclass(frozen=True, kw_only=True)
