@@ -3,7 +3,7 @@
 python scripts/compare_rasterizers.py --load-scene garden.ply --data data/garden
 python scripts/compare_rasterizers.py --load-scene garden.ply --data data/garden --peer other.py
 
-The peer is a Python file with the functions project_np, bin_tiles, forward, backward and _merge (arrays in, arrays out); one thread.
+The peer is a Python file with the functions project_np, bin_tiles, forward, backward and _merge, arrays in, arrays out.
 """
 
 from __future__ import annotations

@@ -21,6 +21,9 @@ from pgsd_nerfstudio.cli.refusal import Refusal
 Kind = Literal["bench", "verify"]
 ROOMS = ("scene", "rendering", "surface", "weather", "physics", "dynamics", "guidance", "evaluation", "export", "plugin")
 
+ALSO = {"rasterizer": "rendering"}
+"""Other names that people look for."""
+
 
 def module_of(room: str) -> str:
     """Name of the module that holds a room's rows."""
@@ -56,10 +59,11 @@ def run_rooms(kind: Kind, room: str | None, *, quick: bool, json: Path | None, s
         Refusal: there is no such room, or the JSON file cannot be written.
     """
     known = rooms_with_rows()
+    command = command_line(kind, room, quick)
+    room = ALSO.get(room, room) if room else None
     if room is not None and room not in known:
         raise Refusal(f'"{room}" offers no figures; expected one of: {", ".join(known) or "none yet"}')
     console, errors = Console(), Console(stderr=True)
-    command = command_line(kind, room, quick)
     console.print(command, style="bold", highlight=False)
     rows: list[Record] = []
     crashed = False
