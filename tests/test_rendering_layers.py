@@ -41,7 +41,9 @@ def test_without_anything_that_moves_the_picture_is_exact(layers):
 def test_before_and_behind_the_whole_scene_any_number_of_layers_is_right(layers, depth):
     """There nothing flies inside a layer: what is left is the rounding to 16 bits, 2e-5 for each layer."""
     frozen = crowd()
-    frozen = replace(frozen, scales=4 * frozen.scales, means=frozen.means + torch.tensor([0.0, 0.0, 15.0]), opacities=0.3 * frozen.opacities)
+    frozen = replace(
+        frozen, scales=4 * frozen.scales, means=frozen.means + torch.tensor([0.0, 0.0, 15.0]), opacities=0.3 * frozen.opacities
+    )
     dynamic = random_gaussians(200, 2, size=0.03 * depth)
     dynamic = replace(dynamic, means=dynamic.means * torch.tensor([0.2, 0.2, 0.0]) * depth + torch.tensor([0.0, 0.0, depth]))
     (exact, truth), (pressed, found) = (rendered(CpuRasterizer(frozen, layers=n), dynamic) for n in (None, layers))

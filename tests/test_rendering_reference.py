@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import roma
 import torch
 
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
-from pgsd_nerfstudio.rendering.reference import project_reference, render_reference
+from pgsd_nerfstudio.rendering.reference import certain_pixels, project_reference, render_reference
 from pgsd_nerfstudio.rendering.spherical_harmonics import sh_basis, view_colors
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -44,7 +45,7 @@ def test_projection_is_that_of_gsplat():
     found = project_reference(gaussians, viewmat[0], K[0], 64, 48, RasterConfig())
     drawn = radii[0] > 0
     assert 500 < drawn.sum() < 2000
-    assert torch.equal(found.radii, radii[0].double())
+    assert torch.equal(found.radii, radii[0, :, None].double().expand(-1, 2))
     assert torch.allclose(found.centers[drawn], centers[0][drawn], rtol=1e-9)
     assert torch.allclose(found.depths[drawn], depths[0][drawn], rtol=1e-12)
     inverse = torch.linalg.inv(found.covariances[drawn])
@@ -143,3 +144,139 @@ def test_turning_scene_and_camera_together_changes_nothing():
     before = render_reference(cameras, gaussians)
     after = render_reference(Cameras(viewmats, cameras.Ks, 24, 24), turned)
     assert torch.allclose(before.rgb, after.rgb, atol=1e-9)
+
+
+def test_a_rectangle_is_that_of_gsplat_1_5():
+    """ProjectionEWA3DGSFused.cu: extend = min(3.33, sqrt(2 ln(opacity / (1/255)))), radius = ceil(extend sqrt(variance))."""
+    gaussians, cameras = random_gaussians(300, size=0.3).to(torch.float64), random_cameras(1, 64, 48)
+    viewmat, K = cameras.viewmats[0].double(), cameras.Ks[0].double()
+    found = project_reference(gaussians, viewmat, K, 64, 48, RasterConfig.of_gsplat("1.5.3"))
+    drawn = 0
+    for k in range(300):
+        (x, y), opacity = found.centers[k].tolist(), gaussians.opacities[k].item()
+        expected = [0.0, 0.0]
+        if (viewmat @ torch.cat([gaussians.means[k], torch.ones(1)]))[2] >= 0.01 and opacity >= 1 / 255:
+            extend = min(3.33, math.sqrt(2 * math.log(opacity * 255)))
+            across, down = (math.ceil(extend * math.sqrt(found.covariances[k, i, i].item())) for i in (0, 1))
+            if x + across > 0 and x - across < 64 and y + down > 0 and y - down < 48:
+                expected = [across, down]
+                drawn += across != down
+        assert found.radii[k].tolist() == expected
+    assert drawn > 50
+
+
+def test_a_rectangle_hides_nothing_that_a_wider_one_would_show():
+    cameras, gaussians = random_cameras(1, 48, 40), random_gaussians(150, opacity=0.3)
+    rectangle = RasterConfig.of_gsplat("1.5.3")
+    found = render_reference(cameras, gaussians, config=rectangle)
+    everywhere = render_reference(cameras, gaussians, config=replace(rectangle, footprint="square", radius_sigmas=100.0))
+    assert (found.rgb - everywhere.rgb).abs().max() < 1e-12
+    assert found.accumulation.max() > 0.5
+
+
+def test_default_conventions_are_those_of_the_installed_gsplat():
+    import gsplat
+
+    assert RasterConfig.of_gsplat(gsplat.__version__) == RasterConfig()
+    with pytest.raises(ValueError, match=r"gsplat 1\.40\.0 are not known"):
+        RasterConfig.of_gsplat("1.40.0")
+
+
+def test_at_equal_depth_the_set_given_first_lies_in_front():
+    red, blue = ball(0, 0, 4.0, 1.0, 0.9, (1.0, 0.0, 0.0)), ball(0, 0, 4.0, 1.0, 0.9, (0.0, 0.0, 1.0))
+    for sets, front in (([red, blue], 0), ([blue, red], 2)):
+        assert render_reference(straight_camera(33, 33), sets).rgb[0, 16, 16, front].item() == pytest.approx(0.9, abs=1e-6)
+
+
+def test_single_precision_draws_the_same_picture():
+    cameras, sets = random_cameras(1, 48, 40), [random_gaussians(100, 1, degree=2), random_gaussians(50, 2)]
+    certain = certain_pixels(cameras, sets)
+    single = render_reference(cameras, sets, dtype=torch.float32).rgb
+    assert single.dtype == torch.float32
+    assert (single - render_reference(cameras, sets).rgb)[certain].abs().max() < 2e-5
+
+
+def smooth(config: RasterConfig) -> RasterConfig:
+    """Without the steps that a difference quotient would stumble over."""
+    return replace(config, footprint="square", min_alpha=1e-12, radius_sigmas=100.0)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "displacements"])
+def test_gradients_are_difference_quotients_also_through_the_direction_of_harmonics(name):
+    cameras, gaussians = random_cameras(1, 12, 10), random_gaussians(12, 3, degree=2, size=0.3, opacity=0.5).to(torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    gaussians = replace(gaussians, displacements=0.3 * torch.randn(12, 3, generator=generator, dtype=torch.float64))
+    weights = torch.randn(1, 10, 12, 3, generator=generator, dtype=torch.float64)
+    value = getattr(gaussians, name)
+    way = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+
+    def loss(tensor: torch.Tensor) -> torch.Tensor:
+        clip = render_reference(cameras, replace(gaussians, **{name: tensor}), config=smooth(RasterConfig()))
+        return (clip.rgb * weights).sum()
+
+    leaf = value.clone().requires_grad_()
+    loss(leaf).backward()
+    quotient = (loss(value + 1e-5 * way) - loss(value - 1e-5 * way)) / 2e-5
+    assert (leaf.grad * way).sum().item() == pytest.approx(quotient.item(), rel=1e-5, abs=1e-9)
+    assert leaf.grad.norm() > 1e-3
+
+
+def degenerate(kind: str) -> Gaussians:
+    """Gaussians at which something divides by zero or loses all its digits."""
+    g = random_gaussians(40, 5, degree=1)
+    if kind == "points":
+        return replace(g, scales=torch.zeros_like(g.scales))
+    if kind == "unturned":
+        return replace(g, quats=torch.zeros_like(g.quats))
+    if kind == "invisible and opaque":
+        return replace(g, opacities=(torch.arange(40) % 2).float())
+    if kind == "needles":
+        return replace(g, scales=torch.tensor([[1e3, 1e-2, 1e-2]]).expand(40, 3).contiguous())
+    if kind == "around the camera":
+        return replace(g, means=g.means * torch.tensor([0.02, 0.02, 0.01]) - torch.tensor([0.0, 0.0, 0.03]))
+    if kind == "at the camera":
+        return replace(g, means=torch.zeros_like(g.means))
+    return g.select(torch.arange(0))
+
+
+@pytest.mark.parametrize(
+    "kind", ["points", "unturned", "invisible and opaque", "needles", "around the camera", "at the camera", "none"]
+)
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("version", ["1.4", "1.5"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_degenerate_stays_finite_there_and_back(kind, moves, version, dtype):
+    gaussians = degenerate(kind)
+    if moves:
+        gaussians = replace(gaussians, displacements=0.5 * torch.randn_like(gaussians.means))
+    leaf = Gaussians(**{name: tensor.clone().requires_grad_() for name, tensor in gaussians.tensors.items()})
+    camera = straight_camera(20, 18)
+    clip = render_reference(camera, [random_gaussians(3), leaf], config=RasterConfig.of_gsplat(version), dtype=dtype)
+    sum(image.sum() for image in clip).backward()
+    assert all(torch.isfinite(image).all() for image in clip)
+    for name, tensor in leaf.tensors.items():
+        assert torch.isfinite(tensor.grad).all(), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_without_blur_what_has_no_area_stays_finite_too(dtype):
+    points, needles = degenerate("points"), degenerate("needles")
+    points = replace(points, displacements=0.5 * torch.randn(40, 3))
+    needles = replace(needles, scales=torch.tensor([[0.3, 3e-6, 3e-6]]).expand(40, 3))
+    for gaussians in (points, needles):
+        leaf = Gaussians(**{name: tensor.clone().requires_grad_() for name, tensor in gaussians.tensors.items()})
+        scene, config = [random_gaussians(3), leaf], RasterConfig(blur=0.0)
+        clip = render_reference(straight_camera(), scene, config=config, dtype=dtype)
+        sum(image.sum() for image in clip).backward()
+        assert all(torch.isfinite(tensor.grad).all() for tensor in leaf.tensors.values())
+
+
+def test_the_zero_quaternion_turns_nothing():
+    gaussians = replace(random_gaussians(30), quats=torch.zeros(30, 4))
+    upright = replace(gaussians, quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(30, 4))
+    camera = random_cameras(1, 24, 24)
+    assert torch.equal(render_reference(camera, gaussians).rgb, render_reference(camera, upright).rgb)
+
+
+def test_no_sets_make_an_empty_picture():
+    assert render_reference(straight_camera(), Gaussians.empty()).accumulation.sum() == 0

@@ -1,63 +1,175 @@
-"""The rasterizer for CUDA: gsplat, with the frozen scene left out of the gradients."""
+"""The rasterizer for CUDA: gsplat's kernels, with the frozen scene projected and sorted once for each camera.
+
+gsplat's own `rasterization` would project, sort and differentiate a frozen scene of millions of Gaussians in every frame, for
+the sake of a few thousand that move. Here its parts are called one by one: per frame only what moves is projected and sorted,
+and merged with the frozen scene's list. The picture is the same.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
+import gsplat
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, dynamic_per_frame
+from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
+from pgsd_nerfstudio.rendering.isects import Isects, merge
+from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
+from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
+from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+
+
+class View(NamedTuple):
+    """One camera, on the device."""
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+
+
+class Splats(NamedTuple):
+    """Gaussians that one camera sees, as gsplat's blending takes them."""
+
+    centers: Float[Tensor, "m 2"]
+    """Pixels."""
+    conics: Float[Tensor, "m 3"]
+    """Inverse covariances on the image plane, upper triangle."""
+    features: Float[Tensor, "m 4"]
+    """Red, green, blue and depth."""
+    opacities: Float[Tensor, "m"]
+
+
+class Sorted(NamedTuple):
+    """Splats, and the tiles they enter."""
+
+    splats: Splats
+    isects: Isects
+
+    @property
+    def nbytes(self) -> int:
+        return sum(tensor.nbytes for tensor in (*self.splats, *self.isects))
 
 
 class GsplatRasterizer:
-    """Renders a frozen scene, and dynamic Gaussians among it, with gsplat."""
+    """Renders a frozen scene, and dynamic Gaussians among it, with gsplat.
 
-    def __init__(self, frozen: Gaussians, *, config: RasterConfig | None = None) -> None:
-        if frozen.device.type != "cuda":
-            raise ValueError(f"GsplatRasterizer expects Gaussians on CUDA, found them on {frozen.device}; call .to('cuda')")
+    The first picture from a camera prepares the frozen scene for it; that is kept on the device, within `cache_bytes`.
+    """
+
+    def __init__(self, frozen: Gaussians, *, config: RasterConfig | None = None, cache_bytes: int = 1 << 30) -> None:
+        """Raises ValueError: the Gaussians are not on CUDA or not finite, or gsplat cannot be configured so."""
+        self._check_device(frozen)
         # What gsplat compiles in cannot be asked of it.
-        self.config = config or RasterConfig()
-        changeable = {"blur": self.config.blur, "near": self.config.near, "far": self.config.far}
-        if self.config != RasterConfig(**changeable):
-            raise ValueError(f"gsplat lets only blur, near and far be chosen, found {self.config}")
+        compiled_in = RasterConfig.of_gsplat(gsplat.__version__)
+        self.config = config or compiled_in
+        if self.config != replace(compiled_in, blur=self.config.blur, near=self.config.near, far=self.config.far):
+            raise ValueError(
+                f"gsplat {gsplat.__version__} lets only blur, near and far be chosen, the rest is {compiled_in}; "
+                f"found {self.config}"
+            )
         frozen.check_finite()
         self.frozen = frozen.detach().to(torch.float32)
+        self.views: ViewCache[Sorted] = ViewCache(cache_bytes)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held by prepared views, in bytes."""
+        return self.views.nbytes
+
+    @property
+    def memory(self) -> str:
+        """As `Rasterizer.memory`."""
+        return str(self.views)
 
     def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
         """As `Rasterizer.render`."""
-        from gsplat import rasterization  # compiles its kernels on first use
+        frames = [self._frame(cameras, k, moving) for k, moving in enumerate(dynamic_per_frame(dynamic, len(cameras)))]
+        clip = torch.stack(frames)
+        return composite(clip[..., :3], clip[..., 3], clip[..., 4], background)
 
-        device = self.frozen.device
-        rgb, depth, accumulation = [], [], []
-        for k, moving in enumerate(dynamic_per_frame(dynamic, len(cameras))):
-            viewmat, K = cameras.viewmats[k].to(device, torch.float32), cameras.Ks[k].to(device, torch.float32)
-            # Harmonics are evaluated here, so that the two sets share one kind of colour and the dynamic one keeps its exactly.
-            scene = replace(self.frozen, colors=view_colors(self.frozen.colors, self.frozen.means, viewmat))
-            if moving is not None:
-                scene = concatenate([scene, moving.to(device, torch.float32)])
-            image, alpha, _ = rasterization(
-                scene.means,
-                scene.quats,
-                scene.scales,
-                scene.opacities,
-                scene.colors,
-                viewmat[None],
-                K[None],
-                cameras.width,
-                cameras.height,
-                near_plane=self.config.near,
-                far_plane=self.config.far,
-                eps2d=self.config.blur,
-                backgrounds=None if background is None else background.to(device, torch.float32)[None],
-                render_mode="RGB+ED",
-                rasterize_mode="classic",
-            )
-            rgb.append(image[0, ..., :3])
-            depth.append(image[0, ..., 3])
-            accumulation.append(alpha[0, ..., 0])
-        return Rendering(torch.stack(rgb), torch.stack(depth), torch.stack(accumulation))
+    @staticmethod
+    def _check_device(frozen: Gaussians) -> None:
+        if frozen.device.type != "cuda":
+            raise ValueError(f"GsplatRasterizer expects Gaussians on CUDA, found them on {frozen.device}; call .to('cuda')")
+
+    def _frame(self, cameras: Cameras, k: int, moving: Gaussians | None) -> Float[Tensor, "h w 5"]:
+        """Sums along the rays: red, green, blue, weighted depth, accumulation."""
+        viewmat, K = (t[k].to(self.frozen.device, torch.float32) for t in (cameras.viewmats, cameras.Ks))
+        view = View(viewmat, K, cameras.width, cameras.height)
+        # The key is made of what the caller holds, mostly on the CPU: the device need not be waited for.
+        scene = self.views.get(cameras.viewmats[k], cameras.Ks[k], view.width, view.height, lambda: self._prepare(view))
+        if moving is None:
+            return _blend(scene, view)
+        movers = self._sort(moving.to(self.frozen.device, torch.float32), view)
+        splats = Splats(*(torch.cat(pair) for pair in zip(scene.splats, movers.splats, strict=True)))
+        return _blend(Sorted(splats, merge(scene.isects, movers.isects, len(scene.splats.centers))), view)
+
+    @torch.no_grad()
+    def _prepare(self, view: View) -> Sorted:
+        return self._sort(self.frozen, view)
+
+    def _sort(self, gaussians: Gaussians, view: View) -> Sorted:
+        """The Gaussians that touch the image, projected and sorted."""
+        radii, *projected = self._project(gaussians, view)
+        seen = torch.nonzero(radii > 0)[:, 0]  # of the others gsplat leaves the memory as it was
+        centers, depths, conics = (tensor[seen] for tensor in projected)
+        gaussians = gaussians.select(seen)
+        colors = view_colors(gaussians.colors, gaussians.means, view.viewmat)
+        splats = Splats(centers, conics, torch.cat([colors, depths[:, None]], dim=1), self._opacities(gaussians, view))
+        return Sorted(splats, _intersect(centers.detach(), radii[seen], depths.detach(), view))
+
+    def _project(self, gaussians: Gaussians, view: View) -> Sequence[Tensor]:
+        """Radii [n] (0 where not drawn), centres [n, 2], depths [n] and conics [n, 3]."""
+        still = gaussians.displacements is None
+        *found, _ = gsplat.fully_fused_projection(
+            gaussians.means,
+            None if still else upper_triangle(stretched_covariances(gaussians)),
+            gaussians.quats if still else None,
+            gaussians.scales if still else None,
+            view.viewmat[None],
+            view.K[None],
+            view.width,
+            view.height,
+            eps2d=self.config.blur,
+            near_plane=self.config.near,
+            far_plane=self.config.far,
+        )
+        return [tensor[0] for tensor in found]
+
+    def _opacities(self, gaussians: Gaussians, view: View) -> Float[Tensor, "m"]:
+        """Averaged over the exposure; all are in front of the camera."""
+        if gaussians.displacements is None:
+            return gaussians.opacities
+        turn = view.viewmat[:3, :3]
+        points = gaussians.means @ turn.T + view.viewmat[:3, 3]
+        to_image = perspective_jacobians(points, view.K, view.width, view.height, self.config.frustum_margin) @ turn
+        flat = to_image @ covariances(gaussians) @ to_image.mT + self.config.blur * torch.eye(2, device=turn.device)
+        return gaussians.opacities * dimming(flat, (to_image @ gaussians.displacements[:, :, None])[:, :, 0])
+
+
+def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:
+    """Of symmetric matrices, row by row, as gsplat takes covariances."""
+    return matrices.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
+
+
+def _intersect(centers: Float[Tensor, "m 2"], radii: Tensor, depths: Float[Tensor, "m"], view: View) -> Isects:
+    across, down = -(-view.width // TILE), -(-view.height // TILE)
+    _, ids, rows = gsplat.isect_tiles(centers[None], radii[None], depths[None], TILE, across, down)
+    return Isects(ids, rows, gsplat.isect_offset_encode(ids, 1, across, down))
+
+
+def _blend(scene: Sorted, view: View) -> Float[Tensor, "h w 5"]:
+    centers, conics, features, opacities = (tensor[None] for tensor in scene.splats)
+    _, rows, offsets = scene.isects
+    sums, accumulation = gsplat.rasterize_to_pixels(
+        centers, conics, features, opacities, view.width, view.height, TILE, offsets, rows
+    )
+    return torch.cat([sums[0], accumulation[0]], dim=-1)

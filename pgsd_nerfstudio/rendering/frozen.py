@@ -7,7 +7,6 @@ costs hardly more than what moves in it, at a small error.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import NamedTuple
 
 import numba
@@ -20,6 +19,7 @@ from pgsd_nerfstudio.rendering.layers import Layers, press
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
+from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
@@ -78,40 +78,25 @@ class FrozenViews:
         self._gaussians = gaussians
         self._config = config
         self._layers = layers
-        self._cache_bytes = cache_bytes
-        self._bytes = 0
-        self._views: OrderedDict[bytes, tuple[View, FrozenView]] = OrderedDict()
+        self._cache: ViewCache[FrozenView] = ViewCache(cache_bytes)
 
     @property
     def nbytes(self) -> int:
         """Memory held now."""
-        return self._bytes
+        return self._cache.nbytes
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._cache)
 
     def __str__(self) -> str:
-        kind = "exact" if self._layers is None else f"{self._layers} layers"
-        held, allowed = self._bytes / 1e6, self._cache_bytes / 1e6
-        return f"{len(self)} prepared views ({kind}), {held:,.0f} of at most {allowed:,.0f} MB"
+        return f"{self._cache} ({'exact' if self._layers is None else f'{self._layers} layers'})"
 
     def get(self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int) -> tuple[View, FrozenView]:
         """The scene for one camera, made if it is not held."""
+        intrinsics = K.detach().cpu().double().numpy()
         pose = np.ascontiguousarray(viewmat.detach().cpu().double().numpy())
-        intrinsics = np.ascontiguousarray(K.detach().cpu().double().numpy())
-        key = pose.tobytes() + intrinsics.tobytes() + f"{width}x{height}".encode()
-        if key in self._views:
-            self._views.move_to_end(key)
-            return self._views[key]
         view = View(pose, lens(intrinsics, width, height, self._config))
-        made = self._make(view)
-        if made.nbytes <= self._cache_bytes:
-            self._views[key] = (view, made)
-            self._bytes += made.nbytes
-        while self._bytes > self._cache_bytes:
-            _, (_, oldest) = self._views.popitem(last=False)
-            self._bytes -= oldest.nbytes
-        return view, made
+        return view, self._cache.get(viewmat, K, width, height, lambda: self._make(view))
 
     def _make(self, view: View) -> FrozenView:
         width, height, workers = view.lens.width, view.lens.height, numba.get_num_threads()

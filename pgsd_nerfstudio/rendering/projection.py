@@ -201,8 +201,10 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens
         still = a * c - b * b
         u, v = on_screen(turn(viewmat, (motions[i, 0], motions[i, 1], motions[i, 2])), bend_x, bend_y, z, lens)
         u, v = SMEAR * u, SMEAR * v
+        # The determinant grows by this (matrix determinant lemma), without the cancellation of a c - b^2 in a thin streak.
+        grown = still + c * u * u - 2.0 * b * u * v + a * v * v
         a, b, c = a + u * u, b + u * v, c + v * v
-        dimming = math.sqrt(still / (a * c - b * b))
+        dimming = math.sqrt(still / grown)
         opacity = opacity * dimming
     spread = a - b * b / c
     if not spread > 0.0 or opacity < lens.min_alpha:

@@ -1,7 +1,7 @@
 """The judge: the same picture in plain float64 torch, differentiable by autograd, as slow as it is short.
 
-Written after gsplat 1.4.0's CUDA sources (fully_fused_projection_fwd.cu, isect_tiles.cu, rasterize_to_pixels_fwd.cu), with
-nothing of the numba kernels. Never a default.
+Written after gsplat's CUDA sources (1.4.0: fully_fused_projection_fwd.cu, isect_tiles.cu, rasterize_to_pixels_fwd.cu; 1.5:
+ProjectionEWA3DGSFused.cu for rectangles), with nothing of the numba kernels. Never a default.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
+from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig, Rendering, composite
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -28,68 +29,71 @@ class Projection(NamedTuple):
     centers: Float[Tensor, "n 2"]
     """Pixels."""
     covariances: Float[Tensor, "n 2 2"]
-    """Pixels squared, blur included."""
+    """Pixels squared, blur and motion included."""
     depths: Float[Tensor, "n"]
-    radii: Float[Tensor, "n"]
-    """Whole pixels, 0 where the Gaussian is not drawn."""
+    opacities: Float[Tensor, "n"]
+    """Averaged over the exposure where the Gaussian moves."""
+    radii: Float[Tensor, "n 2"]
+    """Half sides of the footprint along x and y in whole pixels, 0 where the Gaussian is not drawn."""
 
 
 def project_reference(
     gaussians: Gaussians, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int, config: RasterConfig
 ) -> Projection:
-    """EWA projection of float64 Gaussians."""
+    """EWA projection; Gaussians, `viewmat` and `K` share their dtype."""
     points = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    x, y, z = points.unbind(-1)
-    seen = (z >= config.near) & (z <= config.far)
-    z = torch.where(seen, z, torch.ones_like(z))  # what is not drawn must not divide by zero, neither here nor in the gradient
-    focal, center, extent = K.diagonal()[:2], K[:2, 2], torch.tensor([width, height]).to(K)
-    slopes = torch.stack([x / z, y / z], dim=-1)
-    centers = slopes * focal + center
-    slack = config.frustum_margin * 0.5 * extent / focal
-    bent = torch.maximum(torch.minimum(slopes, (extent - center) / focal + slack), -center / focal - slack)
+    seen = (points[:, 2] >= config.near) & (points[:, 2] <= config.far)
+    # What is not drawn must not divide by zero, neither here nor in the gradient.
+    points = torch.where(seen[:, None], points, torch.tensor([0.0, 0.0, 1.0]).to(points))
+    centers = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
+    to_image = perspective_jacobians(points, K, width, height, config.frustum_margin) @ viewmat[:3, :3]
+    unit = torch.eye(2).to(K)
+    flat = to_image @ covariances(gaussians) @ to_image.mT + config.blur * unit
+    opacities = gaussians.opacities
+    if gaussians.displacements is not None:
+        opacities = opacities * dimming(flat, (to_image @ gaussians.displacements[:, :, None])[:, :, 0])
+        flat = to_image @ stretched_covariances(gaussians) @ to_image.mT + config.blur * unit
+    drawn = seen & (_determinants(flat) > 0)
+    radii = _half_sides(flat, opacities, config)
+    inside = ((centers + radii > 0) & (centers - radii < torch.tensor([width, height]).to(K))).all(dim=-1)
+    return Projection(centers, flat, points[:, 2], opacities, torch.where((drawn & inside)[:, None], radii, 0.0))
 
-    rotations = roma.unitquat_to_rotmat(torch.nn.functional.normalize(gaussians.quats, dim=-1)[:, [1, 2, 3, 0]])
-    factors = viewmat[:3, :3] @ rotations * gaussians.scales[:, None, :]
-    covariances = factors @ factors.mT
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([focal[0] / z, zero, -focal[0] * bent[:, 0] / z], dim=-1),
-            torch.stack([zero, focal[1] / z, -focal[1] * bent[:, 1] / z], dim=-1),
-        ],
-        dim=-2,
-    )
-    flat = jacobian @ covariances @ jacobian.mT + config.blur * torch.eye(2).to(K)
 
-    mean = 0.5 * (flat[:, 0, 0] + flat[:, 1, 1])
-    largest = mean + (mean**2 - torch.linalg.det(flat)).clamp_min(0.01).sqrt()
-    radii = (config.radius_sigmas * largest.sqrt()).ceil()
-    inside = ((centers + radii[:, None] > 0) & (centers - radii[:, None] < extent)).all(dim=-1)
-    return Projection(centers, flat, z, torch.where(seen & inside, radii, zero).detach())
+def _determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n"]:
+    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] ** 2
+
+
+@torch.no_grad()
+def _half_sides(
+    covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, "n"], config: RasterConfig
+) -> Float[Tensor, "n 2"]:
+    """Of the footprint, whole pixels."""
+    variances = covariances.diagonal(dim1=1, dim2=2)
+    if config.footprint == "square":
+        mean = variances.mean(dim=1, keepdim=True)
+        largest = mean + (mean**2 - _determinants(covariances)[:, None]).clamp_min(0.01).sqrt()
+        return (config.radius_sigmas * largest.sqrt()).ceil().expand(-1, 2)
+    sigmas = (2.0 * (opacities / config.min_alpha).clamp_min(1.0).log()).sqrt().clamp_max(config.radius_sigmas)
+    return (sigmas[:, None] * variances.sqrt()).ceil()
 
 
 def _enters(projection: Projection, left: int, top: int) -> Bool[Tensor, "n"]:
-    """Whether the square around each Gaussian touches the tile at (left, top)."""
+    """Whether the footprint of each Gaussian touches the tile at (left, top)."""
     corner = torch.tensor([left, top]).to(projection.centers)
-    radii = projection.radii[:, None]
-    first = torch.floor((projection.centers - radii) / TILE) * TILE
-    last = torch.ceil((projection.centers + radii) / TILE) * TILE
-    return ((first <= corner) & (corner < last)).all(dim=-1) & (projection.radii > 0)
+    first = torch.floor((projection.centers - projection.radii) / TILE) * TILE
+    last = torch.ceil((projection.centers + projection.radii) / TILE) * TILE
+    return ((first <= corner) & (corner < last) & (projection.radii > 0)).all(dim=-1)
 
 
 def _blend(
-    pixels: Float[Tensor, "p 2"],
-    projection: Projection,
-    opacities: Float[Tensor, "n"],
-    colors: Float[Tensor, "n 3"],
-    config: RasterConfig,
+    pixels: Float[Tensor, "p 2"], projection: Projection, colors: Float[Tensor, "n 3"], config: RasterConfig
 ) -> Float[Tensor, "p 5"]:
     """Red, green, blue, weighted depth and accumulation at pixel centres; Gaussians come nearest first."""
     dx, dy = (pixels[:, None, :] - projection.centers).unbind(-1)
-    conics = torch.linalg.inv(projection.covariances)
-    sigma = 0.5 * (conics[:, 0, 0] * dx**2 + conics[:, 1, 1] * dy**2) + conics[:, 0, 1] * dx * dy
-    alpha = (opacities * torch.exp(-sigma)).clamp_max(config.max_alpha)
-    alpha = torch.where(alpha >= config.min_alpha, alpha, torch.zeros_like(alpha))
+    a, b, c = projection.covariances.flatten(1)[:, [0, 1, 3]].unbind(-1)
+    sigma = (0.5 * (c * dx**2 + a * dy**2) - b * dx * dy) / _determinants(projection.covariances)
+    alpha = (projection.opacities * torch.exp(-sigma)).clamp_max(config.max_alpha)
+    alpha = torch.where(alpha >= config.min_alpha, alpha, 0.0)
     after = torch.cumprod(1.0 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     # Light only falls along the ray, so all behind the first Gaussian that lets too little through is cut off with it.
@@ -102,10 +106,16 @@ def render_reference(
     gaussians: Gaussians | Sequence[Gaussians],
     background: Float[Tensor, "3"] | None = None,
     config: RasterConfig | None = None,
+    *,
+    dtype: torch.dtype = torch.float64,
 ) -> Rendering:
-    """Render one set, or several (each with plain RGB or harmonics) as one scene; float64, differentiable in all of them."""
+    """Render one set, or several (each with plain RGB or harmonics) as one scene; differentiable in all of them.
+
+    Gaussians of equal depth are drawn in the order given. In float64 it is the judge; with `dtype` float32 it stands in
+    benches for a vectorised torch rasterizer of the same conventions.
+    """
     config = config or RasterConfig()
-    sets = [one.to(torch.float64) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
+    sets = [one.to(dtype) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
     clip = torch.stack([_render_frame(cameras, k, sets, config) for k in range(len(cameras))])
     return composite(clip[..., :3], clip[..., 3], clip[..., 4], background)
 
@@ -129,22 +139,21 @@ def certain_pixels(
 
 
 def _render_frame(cameras: Cameras, k: int, sets: Sequence[Gaussians], config: RasterConfig) -> Float[Tensor, "h w 5"]:
-    viewmat, K = cameras.viewmats[k].double(), cameras.Ks[k].double()
+    viewmat, K = cameras.viewmats[k].to(sets[0].means), cameras.Ks[k].to(sets[0].means)
     parts = [project_reference(one, viewmat, K, cameras.width, cameras.height, config) for one in sets]
     projection = Projection(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
-    opacities = torch.cat([one.opacities for one in sets])
     colors = torch.cat([view_colors(one.colors, one.means, viewmat) for one in sets])
     order = projection.depths.float().argsort(stable=True)  # gsplat sorts single precision depths
-    image = torch.zeros(cameras.height, cameras.width, 5, dtype=torch.float64)
+    image = torch.zeros(cameras.height, cameras.width, 5).to(viewmat)
     for top in range(0, cameras.height, TILE):
         for left in range(0, cameras.width, TILE):
             chosen = order[_enters(projection, left, top)[order]]
             if len(chosen):
                 y = torch.arange(top, min(top + TILE, cameras.height))
                 x = torch.arange(left, min(left + TILE, cameras.width))
-                pixels = torch.cartesian_prod(y, x).flip(-1).double() + 0.5
+                pixels = torch.cartesian_prod(y, x).flip(-1).to(viewmat) + 0.5
                 here = Projection(*(t[chosen] for t in projection))
                 # Intermediate values are made again on the way back: kept, those of one large scene would fill the memory.
-                tile = checkpoint(_blend, pixels, here, opacities[chosen], colors[chosen], config, use_reentrant=False)
+                tile = checkpoint(_blend, pixels, here, colors[chosen], config, use_reentrant=False)
                 image[y[0] : y[-1] + 1, x[0] : x[-1] + 1] = tile.view(len(y), len(x), 5)
     return image
