@@ -54,7 +54,7 @@ class Compare:
         for width, height in ((96, 64), (648, 420)):
             cameras = scene.cameras[self.view].resized(width, height)
             case = Case(cameras, scene.gaussians, flakes_before(scene, cameras, self.dynamic))
-            rows += costs(case, tries=self.tries, threads=(1, 2), window=32)
+            rows += costs(case, tries=self.tries, window=32, threads=2)
             rows.append(everything(case, self.tries))
             if self.peer is not None:
                 rows += beside(case, _module(self.peer), self.tries)

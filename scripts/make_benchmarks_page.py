@@ -13,6 +13,7 @@ from pathlib import Path
 from pgsd_nerfstudio.cli.records import Record, figure, read_records, split_source, verdict
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
+LONG = 60  # rows from which a table is folded away
 HEAD = """# Figures
 
 Made by `scripts/make_benchmarks_page.py` from the JSON files in `docs/figures/`; edit none of it by hand. Each heading is the
@@ -27,7 +28,11 @@ def page(files: list[Path]) -> str:
     rows = [row for path in files for row in read_records(path)]
     for run, group in groupby(rows, key=lambda row: split_source(row.source)[1]):
         command, _, machine = run.partition(" on ")
-        parts.append(f"## `{command}`\n\n{machine}\n\n{table(list(group))}")
+        rows_here = list(group)
+        body = table(rows_here)
+        if len(rows_here) > LONG:
+            body = f"<details><summary>{len(rows_here)} rows</summary>\n\n{body}\n</details>\n"
+        parts.append(f"## `{command}`\n\n{machine}\n\n{body}")
     return "\n".join(parts)
 
 

@@ -44,7 +44,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def main() -> None:
     """Entry point of the `pgsd` command."""
-    os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
     sys.exit(run())
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pgsd_nerfstudio.rendering.compilation import kernel
-from pgsd_nerfstudio.rendering.projection import BOTTOM, COLUMNS, DEPTH, LEFT, RIGHT, TOP
+from pgsd_nerfstudio.rendering.projection import BOTTOM, DEPTH, LEFT, RIGHT, TOP
 from pgsd_nerfstudio.rendering.rasterizer import TILE
 
 
@@ -59,15 +59,6 @@ def visible_by_depth(splats):
         order, other = other, order
         bits, other_keys = other_keys, bits
     return order
-
-
-@kernel()
-def gather(splats, order):
-    """Rows of `splats` in another order."""
-    chosen = np.empty((order.shape[0], COLUMNS), np.float32)
-    for k in range(order.shape[0]):
-        chosen[k] = splats[order[k]]
-    return chosen
 
 
 @kernel()

@@ -12,9 +12,9 @@ An image here is one array [5, h, w]: light let through, red, green, blue, depth
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.binning import Binned
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out, workers
 from pgsd_nerfstudio.rendering.projection import (
     BLUE,
     BOTTOM,
@@ -135,9 +135,10 @@ def _reaches(splats, i, tile, left, top):
 @inlined()
 def clear_tile(tile, columns, rows):
     """An empty tile of which `columns` x `rows` pixels lie in the image."""
-    tile[:] = F(0)
     for y in range(TILE):
         row = tile[y]
+        for x in range(ROW):
+            row[x] = F(0)
         for x in range(16):
             row[LIGHT + x] = F(1) if (y < rows) & (x < columns) else F(-1)
 
@@ -157,31 +158,42 @@ def store_tile(tile, columns, rows, left, top, image):
                     target[x] = abs(row[16 * plane + x]) if plane == 0 else row[16 * plane + x]
 
 
-@parallel_kernel()
-def blend_frozen(frozen, width, height, workers, max_alpha, min_transmittance, image, needed):
-    """Blend the frozen splats alone, and mark in `needed` [k] which entries did anything.
+def blend_frozen(
+    frozen: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32, written
+    needed: np.ndarray,  # [k] bool, false; written
+) -> None:
+    """Blend the frozen splats alone, and mark in `needed` which entries did anything.
 
     What does nothing here does nothing either among dynamic splats, which only take light away: such entries (a corner of the
     tile that the ellipse misses, what lies behind an opaque wall) can be dropped without changing any picture.
-
-    Worker k takes every `workers`-th tile from k on: neighbours cost alike, so the shares are even and always the same.
     """
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    splats, entries = frozen.splats, frozen.entries
-    for worker in prange(workers):
-        tile = aligned(TILE, ROW)
-        for t in range(worker, tiles, workers):
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            columns, rows = min(TILE, width - left), min(TILE, height - top)
-            clear_tile(tile, columns, rows)
-            for k in range(frozen.offsets[t], frozen.offsets[t + 1]):
-                if k % CHECK_EVERY == 0 and not any_light(tile):
-                    break
-                needed[k] = _reaches(splats, entries[k], tile, left, top)
-                if needed[k]:
-                    blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
-            store_tile(tile, columns, rows, left, top, image)
+    count = workers()
+    share_out(
+        _blend_frozen, count, aligned(count, TILE, ROW), frozen, width, height, max_alpha, min_transmittance, image, needed
+    )
+
+
+@kernel()
+def _blend_frozen(worker, workers, tiles, frozen, width, height, max_alpha, min_transmittance, image, needed):
+    """Every `workers`-th tile from `worker` on: neighbours cost alike, so the shares are even and always the same."""
+    tile, splats, entries = tiles[worker], frozen.splats, frozen.entries
+    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        left, top = (t % across) * TILE, (t // across) * TILE
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        clear_tile(tile, columns, rows)
+        for k in range(frozen.offsets[t], frozen.offsets[t + 1]):
+            if k % CHECK_EVERY == 0 and not any_light(tile):
+                break
+            needed[k] = _reaches(splats, entries[k], tile, left, top)
+            if needed[k]:
+                blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
+        store_tile(tile, columns, rows, left, top, image)
 
 
 @kernel()
@@ -202,18 +214,30 @@ def _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance
             break
 
 
-@parallel_kernel()
-def blend_merged(frozen, dynamic, width, height, workers, max_alpha, min_transmittance, image):
+def blend_merged(
+    frozen: Binned,
+    dynamic: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32, changed
+) -> None:
     """Blend again those tiles that have dynamic splats; the image comes as `blend_frozen` left it."""
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    for worker in prange(workers):
-        tile = aligned(TILE, ROW)
-        for t in range(worker, tiles, workers):
-            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
-                continue
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            columns, rows = min(TILE, width - left), min(TILE, height - top)
-            clear_tile(tile, columns, rows)
-            _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance)
-            store_tile(tile, columns, rows, left, top, image)
+    count = workers()
+    share_out(
+        _blend_merged, count, aligned(count, TILE, ROW), frozen, dynamic, width, height, max_alpha, min_transmittance, image
+    )
+
+
+@kernel()
+def _blend_merged(worker, workers, tiles, frozen, dynamic, width, height, max_alpha, min_transmittance, image):
+    tile, across, down = tiles[worker], (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+            continue
+        left, top = (t % across) * TILE, (t // across) * TILE
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        clear_tile(tile, columns, rows)
+        _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance)
+        store_tile(tile, columns, rows, left, top, image)

@@ -11,10 +11,10 @@ No transmittance is ever divided out, the walk ends at the last dynamic splat of
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
+from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.blending import CHECK_EVERY, any_light, falloff, row_misses
-from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out
 from pgsd_nerfstudio.rendering.projection import (
     BLUE,
     BOTTOM,
@@ -159,9 +159,10 @@ def _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance
 @inlined()
 def start_tile(tile, columns, rows, left, top, image, to_image):
     """A tile [16, 96] before the first splat: all light, everything still to come."""
-    tile[:] = F(0)
     for y in range(TILE):
         row = tile[y]
+        for x in range(ROW):
+            row[x] = F(0)
         for x in range(16):
             row[LIGHT + x] = F(1) if (y < rows) & (x < columns) else F(-1)
     for plane in range(5):
@@ -181,22 +182,36 @@ def start_tile(tile, columns, rows, left, top, image, to_image):
                         row[place + x] = to_found[x]
 
 
-@parallel_kernel()
-def blend_backward(frozen, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients):
-    """Add the gradients of the dynamic splats to `gradients` [workers, m, 10].
+def blend_backward(
+    frozen: Binned,
+    dynamic: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32: the result of blend_merged
+    to_image: np.ndarray,  # [5, h, w] float32: its gradient
+    gradients: np.ndarray,  # [workers, m, 10] float32, added to
+) -> None:
+    """Add the gradients of the dynamic splats to `gradients`.
 
-    `image` is the result of `blend_merged`, `to_image` its gradient. Each worker has its own sums: no two write to one place,
-    and the order of summation never changes.
+    Each worker has its own sums: no two write to one place, and the order of summation never changes.
     """
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    workers = gradients.shape[0]
-    for worker in prange(workers):
-        tile, sums = aligned(TILE, ROW), aligned(1, SUMS)[0]
-        sums[:] = F(0)
-        for t in range(worker, tiles, workers):
-            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
-                continue
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
-            _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients[worker])
+    count = len(gradients)
+    scratch = aligned(count, TILE, ROW), aligned(count, SUMS)
+    numbers = width, height, max_alpha, min_transmittance
+    share_out(_blend_backward, count, *scratch, frozen, dynamic, *numbers, image, to_image, gradients)
+
+
+@kernel()
+def _blend_backward(
+    worker, workers, tiles, sums, frozen, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients
+):
+    tile, own_sums, own = tiles[worker], sums[worker], gradients[worker]
+    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+            continue
+        left, top = (t % across) * TILE, (t // across) * TILE
+        start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
+        _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, own_sums, own)

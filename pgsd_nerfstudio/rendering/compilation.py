@@ -1,20 +1,23 @@
-"""How the numba kernels of this room are compiled and run.
+"""How the numba kernels of this room are compiled, and run on several threads.
 
 Compiled kernels are kept on disk and made anew when the file they stand in changes, but not when a kernel or a constant from
 another file does: after such a change, delete __pycache__.
+
+Threads are Python's own, which run at once since kernels need no interpreter. numba's `parallel=True` would do the same for
+twice the compilation, and its OpenMP threads spin while they wait for those of torch.
 """
 
 from __future__ import annotations
 
-import threading
-from functools import partial
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 
 import numba
 import numpy as np
-
-# GNU OpenMP comes with every numba wheel; TBB is refused beside Open3D's older one, and "workqueue" crashes when two Python
-# threads render at once. Set before the first parallel kernel is compiled.
-numba.config.THREADING_LAYER = "omp"  # type: ignore[attr-defined]
+import torch
+from jaxtyping import Float
 
 # Reordering and fused operations, but comparisons with NaN and infinity keep their meaning (no "nnan", no "ninf").
 _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
@@ -22,19 +25,31 @@ _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath=_MATH)
 """Decorator of a kernel for one thread."""
 
-parallel_kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath=_MATH, parallel=True)
-"""Decorator of a kernel that runs on all threads."""
-
 inlined = partial(numba.njit, inline="always")
 """Decorator of a piece of a kernel."""
 
-rendering_lock = threading.RLock()
-"""Held while kernels run: several Python threads (a viewer beside a training) may render, one at a time."""
+
+def workers() -> int:
+    """How many threads kernels run on: as many as torch uses."""
+    return torch.get_num_threads()
 
 
-@kernel()
-def aligned(rows, columns):
-    """Uninitialised float32 [rows, columns] that begins with a cache line: 16 floats then never lie across two of them."""
-    buffer = np.empty(rows * columns + 16, np.float32)
-    start = (-(buffer.ctypes.data // 4)) % 16
-    return buffer[start : start + rows * columns].reshape(rows, columns)
+def share_out(work: Callable[..., None], count: int, *arguments: object) -> None:
+    """Run `work(worker, count, *arguments)` for the workers 0 .. count - 1, each on a thread of its own."""
+    others = [_pool().submit(work, worker, count, *arguments) for worker in range(1, count)]
+    work(0, count, *arguments)
+    for other in others:
+        other.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(os.cpu_count() or 1, workers()), thread_name_prefix="rasterizer")
+
+
+def aligned(*shape: int) -> Float[np.ndarray, "..."]:
+    """Zeros in float32 that begin with a cache line, so that sixteen of them never lie across two."""
+    size = int(np.prod(shape))
+    buffer = np.zeros(size + 16, np.float32)
+    start = -(buffer.ctypes.data // 4) % 16
+    return buffer[start : start + size].reshape(shape)

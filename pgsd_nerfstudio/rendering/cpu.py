@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.blending import blend_merged
 from pgsd_nerfstudio.rendering.blending_gradient import blend_backward
-from pgsd_nerfstudio.rendering.compilation import rendering_lock
+from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.layers_walk import blend_layered, blend_layered_backward
@@ -65,14 +64,13 @@ class CpuRasterizer:
             raise ValueError("the cameras' viewmats and Ks must be finite, found NaN or infinite values")
         frames = []
         for k, moving in enumerate(dynamic_per_frame(dynamic, len(cameras))):
-            with rendering_lock:
-                view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height)
-                if moving is None:
-                    frames.append(torch.from_numpy(frozen.image))
-                else:
-                    colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
-                    tensors = {**moving.tensors, "colors": colors}
-                    frames.append(_RenderMerged.apply(view, frozen, self.config, *tensors.values()))
+            view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height)
+            if moving is None:
+                frames.append(torch.from_numpy(frozen.image))
+            else:
+                colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
+                tensors = {**moving.tensors, "colors": colors}
+                frames.append(_RenderMerged.apply(view, frozen, self.config, *tensors.values()))
         clip = torch.stack(frames)
         return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], background)
 
@@ -96,10 +94,10 @@ class _RenderMerged(torch.autograd.Function):
     def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, *tensors: Tensor) -> Tensor:
         dynamic, ids = splat(Gaussians(*tensors), view)
         image = frozen.image.copy()
-        width, height, workers = view.lens.width, view.lens.height, numba.get_num_threads()
+        width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
         blend = blend_layered if isinstance(frozen.part, Layers) else blend_merged
-        blend(frozen.part, dynamic, width, height, workers, *limits, image)
+        blend(frozen.part, dynamic, width, height, *limits, image)
         ctx.save_for_backward(*tensors)
         ctx.walk = _Walk(view, frozen.part, dynamic, ids, limits, image)
         return torch.from_numpy(image)
@@ -107,8 +105,7 @@ class _RenderMerged(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_image: Tensor) -> tuple[Tensor | None, ...]:
-        with rendering_lock:
-            gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
+        gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
         typed = (gradient.to(tensor.dtype) for gradient, tensor in zip(gradients, ctx.saved_tensors, strict=True))
         return None, None, None, *typed
 
@@ -117,7 +114,7 @@ def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tens
     """Gradients of the tensors of the dynamic Gaussians, in their order."""
     view, part, dynamic, ids, limits, image = walk
     lens = view.lens
-    to_splats = np.zeros((numba.get_num_threads(), len(ids), GRADIENT_COLUMNS), np.float32)
+    to_splats = np.zeros((workers(), len(ids), GRADIENT_COLUMNS), np.float32)
     back = blend_layered_backward if isinstance(part, Layers) else blend_backward
     back(part, dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats)
     means, quats, scales = (float_array(tensor) for tensor in (gaussians.means, gaussians.quats, gaussians.scales))

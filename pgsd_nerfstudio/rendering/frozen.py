@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 
-from pgsd_nerfstudio.rendering.binning import Binned, bin_splats, gather, keep_entries, visible_by_depth
+from pgsd_nerfstudio.rendering.binning import Binned, bin_splats, keep_entries, visible_by_depth
 from pgsd_nerfstudio.rendering.blending import blend_frozen
 from pgsd_nerfstudio.rendering.layers import Layers, press
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
@@ -61,7 +60,7 @@ def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
     shapes = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     project(*(float_array(t) for t in shapes), motions_array(gaussians), view.viewmat, view.lens, splats)
     ids = visible_by_depth(splats)
-    visible = gather(splats, ids)
+    visible = splats[ids]
     if gaussians.colors.ndim == 2:
         visible[:, RED : BLUE + 1] = float_array(gaussians.colors)[ids]
     else:
@@ -99,11 +98,11 @@ class FrozenViews:
         return view, self._cache.get(viewmat, K, width, height, lambda: self._make(view))
 
     def _make(self, view: View) -> FrozenView:
-        width, height, workers = view.lens.width, view.lens.height, numba.get_num_threads()
+        width, height = view.lens.width, view.lens.height
         binned, _ = splat(self._gaussians, view)
         needed = np.zeros(len(binned.entries), bool)
         image = np.empty((5, height, width), np.float32)
         limits = np.float32(self._config.max_alpha), np.float32(self._config.min_transmittance)
-        blend_frozen(binned, width, height, workers, *limits, image, needed)
+        blend_frozen(binned, width, height, *limits, image, needed)
         part = keep_entries(binned, needed)
-        return FrozenView(part if self._layers is None else press(part, width, height, workers, *limits, self._layers), image)
+        return FrozenView(part if self._layers is None else press(part, width, height, *limits, self._layers), image)

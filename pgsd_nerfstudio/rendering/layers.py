@@ -12,11 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.blending import LIGHT, ROW, B, G, R, Z, blend_splat, clear_tile
-from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out, workers
 from pgsd_nerfstudio.rendering.projection import DEPTH
 from pgsd_nerfstudio.rendering.rasterizer import TILE
 
@@ -88,46 +87,43 @@ def _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends
     return layers
 
 
-@parallel_kernel()
-def _split_all(frozen, width, height, workers, max_alpha, min_transmittance, count, numbers, ends, depths):
+@kernel()
+def _split_all(worker, workers, tiles, frozen, width, height, max_alpha, min_transmittance, count, numbers, ends, depths):
     """Numbers [tiles], ends [tiles, count] and depths [tiles, count] of the layers."""
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    for worker in prange(workers):
-        tile = aligned(TILE, ROW)
-        for t in range(worker, tiles, workers):
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
-            numbers[t] = _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends[t], depths[t])
+    tile, across, down = tiles[worker], (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        left, top = (t % across) * TILE, (t // across) * TILE
+        clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+        numbers[t] = _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends[t], depths[t])
 
 
-@parallel_kernel()
-def _fill(frozen, width, height, workers, max_alpha, min_transmittance, offsets, ends, planes, steps):
+@kernel()
+def _fill(worker, workers, tiles, frozen, width, height, max_alpha, min_transmittance, offsets, ends, planes, steps):
     """Planes of all layers: what changed in the tile from one end to the next, relative to the light that came in.
 
     The differences cancel where little light is left, and just there they count for as little: no dynamic splat adds light.
     """
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
+    tile, before, layer = tiles[worker, 0], tiles[worker, 1], tiles[worker, 2]
     splats, entries = frozen.splats, frozen.entries
-    for worker in prange(workers):
-        tile, layer = aligned(TILE, ROW), aligned(TILE, ROW)
-        for t in range(worker, tiles, workers):
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
-            k = frozen.offsets[t]
-            for n in range(offsets[t], offsets[t + 1]):
-                before = tile.copy()
-                while k < ends[t, n - offsets[t]]:
-                    blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
-                    k += 1
-                for y in range(TILE):
-                    for x in range(TILE):
-                        came = abs(before[y, LIGHT + x])
-                        layer[y, LIGHT + x] = abs(tile[y, LIGHT + x]) / came
-                        for plane in (R, G, B, Z):
-                            layer[y, plane + x] = (tile[y, plane + x] - before[y, plane + x]) / came
-                _quantise(layer, planes[n], steps[n])
+    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        left, top = (t % across) * TILE, (t // across) * TILE
+        clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+        k = frozen.offsets[t]
+        for n in range(offsets[t], offsets[t + 1]):
+            for y in range(TILE):
+                for x in range(ROW):
+                    before[y, x] = tile[y, x]
+            while k < ends[t, n - offsets[t]]:
+                blend_splat(splats, entries[k], tile, left, top, max_alpha, min_transmittance)
+                k += 1
+            for y in range(TILE):
+                for x in range(TILE):
+                    came = abs(before[y, LIGHT + x])
+                    layer[y, LIGHT + x] = abs(tile[y, LIGHT + x]) / came
+                    for plane in (R, G, B, Z):
+                        layer[y, plane + x] = (tile[y, plane + x] - before[y, plane + x]) / came
+            _quantise(layer, planes[n], steps[n])
 
 
 @kernel()
@@ -144,16 +140,14 @@ def _quantise(layer, planes, steps):
                 planes[y, place + x] = np.uint16(max(layer[y, place + x], F(0)) / steps[plane] + F(0.5))
 
 
-def press(
-    frozen: Binned, width: int, height: int, workers: int, max_alpha: np.float32, min_transmittance: np.float32, count: int
-) -> Layers:
+def press(frozen: Binned, width: int, height: int, max_alpha: np.float32, min_transmittance: np.float32, count: int) -> Layers:
     """At most `count` layers for each tile."""
-    tiles = len(frozen.offsets) - 1
+    tiles, threads = len(frozen.offsets) - 1, workers()
     numbers, ends = np.zeros(tiles, np.int32), np.zeros((tiles, count), np.int32)
     depths = np.zeros((tiles, count), np.float32)
-    limits = max_alpha, min_transmittance
-    _split_all(frozen, width, height, workers, *limits, count, numbers, ends, depths)
+    scene = frozen, width, height, max_alpha, min_transmittance
+    share_out(_split_all, threads, aligned(threads, TILE, ROW), *scene, count, numbers, ends, depths)
     offsets = np.concatenate([[0], np.cumsum(numbers)]).astype(np.int32)
     planes, steps = np.empty((offsets[-1], TILE, ROW), np.uint16), np.empty((offsets[-1], 5), np.float32)
-    _fill(frozen, width, height, workers, *limits, offsets, ends, planes, steps)
+    share_out(_fill, threads, aligned(threads, 3, TILE, ROW), *scene, offsets, ends, planes, steps)
     return Layers(offsets, depths[np.arange(count) < numbers[:, None]], planes, steps)

@@ -3,8 +3,9 @@ among its splats."""
 
 from __future__ import annotations
 
-from numba import prange
+import numpy as np
 
+from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.blending import (
     CHECK_EVERY,
     LIGHT,
@@ -21,7 +22,8 @@ from pgsd_nerfstudio.rendering.blending import (
 )
 from pgsd_nerfstudio.rendering.blending_gradient import BEHIND, SUMS, TO_B, TO_G, TO_R, TO_Z, pass_dynamic, start_tile
 from pgsd_nerfstudio.rendering.blending_gradient import ROW as GRADIENT_ROW
-from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out, workers
+from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.projection import DEPTH
 from pgsd_nerfstudio.rendering.rasterizer import TILE
 
@@ -60,21 +62,33 @@ def _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance
         k += 1
 
 
-@parallel_kernel()
-def blend_layered(layers, dynamic, width, height, workers, max_alpha, min_transmittance, image):
+def blend_layered(
+    layers: Layers,
+    dynamic: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32, changed
+) -> None:
     """As `blend_merged`, with layers in place of the frozen splats."""
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    for worker in prange(workers):
-        tile = aligned(TILE, ROW)
-        for t in range(worker, tiles, workers):
-            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
-                continue
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            columns, rows = min(TILE, width - left), min(TILE, height - top)
-            clear_tile(tile, columns, rows)
-            _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance)
-            store_tile(tile, columns, rows, left, top, image)
+    count = workers()
+    share_out(
+        _blend_layered, count, aligned(count, TILE, ROW), layers, dynamic, width, height, max_alpha, min_transmittance, image
+    )
+
+
+@kernel()
+def _blend_layered(worker, workers, tiles, layers, dynamic, width, height, max_alpha, min_transmittance, image):
+    tile, across, down = tiles[worker], (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+            continue
+        left, top = (t % across) * TILE, (t // across) * TILE
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        clear_tile(tile, columns, rows)
+        _walk_tile(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance)
+        store_tile(tile, columns, rows, left, top, image)
 
 
 @inlined()
@@ -110,18 +124,33 @@ def _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_tran
             return
 
 
-@parallel_kernel()
-def blend_layered_backward(layers, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients):
+def blend_layered_backward(
+    layers: Layers,
+    dynamic: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32: the result of blend_layered
+    to_image: np.ndarray,  # [5, h, w] float32: its gradient
+    gradients: np.ndarray,  # [workers, m, 10] float32, added to
+) -> None:
     """As `blend_backward`, for an image of `blend_layered`."""
-    tiles_across = (width + TILE - 1) // TILE
-    tiles = tiles_across * ((height + TILE - 1) // TILE)
-    workers = gradients.shape[0]
-    for worker in prange(workers):
-        tile, sums = aligned(TILE, GRADIENT_ROW), aligned(1, SUMS)[0]
-        sums[:] = F(0)
-        for t in range(worker, tiles, workers):
-            if dynamic.offsets[t] == dynamic.offsets[t + 1]:
-                continue
-            left, top = (t % tiles_across) * TILE, (t // tiles_across) * TILE
-            start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
-            _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients[worker])
+    count = len(gradients)
+    scratch = aligned(count, TILE, GRADIENT_ROW), aligned(count, SUMS)
+    numbers = width, height, max_alpha, min_transmittance
+    share_out(_blend_layered_backward, count, *scratch, layers, dynamic, *numbers, image, to_image, gradients)
+
+
+@kernel()
+def _blend_layered_backward(
+    worker, workers, tiles, sums, layers, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients
+):
+    tile, own_sums, own = tiles[worker], sums[worker], gradients[worker]
+    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    for t in range(worker, across * down, workers):
+        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+            continue
+        left, top = (t % across) * TILE, (t // across) * TILE
+        start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
+        _walk_tile_backward(layers, dynamic, t, tile, left, top, max_alpha, min_transmittance, own_sums, own)

@@ -19,9 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
-from pgsd_nerfstudio.rendering.compilation import kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import kernel, share_out, workers
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig
 
 # Columns of a projected Gaussian ("splat"): 16 floats, one cache line.
@@ -225,13 +224,22 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens
         splats[i, LEFT], splats[i, RIGHT], splats[i, TOP], splats[i, BOTTOM] = left, right, top, bottom
 
 
-@parallel_kernel()
-def project(means, quats, scales, opacities, motions, viewmat, lens, splats):
-    """Fill the geometry of `splats` [n, 16]; colours are left alone.
+def project(
+    means: np.ndarray,  # [n, 3] float32
+    quats: np.ndarray,  # [n, 4] float32
+    scales: np.ndarray,  # [n, 3] float32
+    opacities: np.ndarray,  # [n] float32
+    motions: np.ndarray,  # [n, 3] float32, or [0, 3] where nothing moves
+    viewmat: np.ndarray,  # [4, 4] float64
+    lens: Lens,
+    splats: np.ndarray,  # [n, 16] float32, written
+) -> None:
+    """Fill the geometry of `splats`; colours are left alone."""
+    share_out(_project, workers(), means, quats, scales, opacities, motions, viewmat, lens, splats)
 
-    means [n, 3], quats [n, 4], scales [n, 3], opacities [n] float32; motions [n, 3], or [0, 3] where nothing moves; viewmat
-    [4, 4] float64.
-    """
-    moves = motions.shape[0] > 0
-    for i in prange(means.shape[0]):
+
+@kernel()
+def _project(worker, workers, means, quats, scales, opacities, motions, viewmat, lens, splats):
+    n, moves = means.shape[0], motions.shape[0] > 0
+    for i in range(n * worker // workers, n * (worker + 1) // workers):
         _project_one(i, means, quats, scales, np.float64(opacities[i]), motions, moves, viewmat, lens, splats)

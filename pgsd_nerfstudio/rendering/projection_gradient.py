@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from pgsd_nerfstudio.rendering.compilation import kernel, parallel_kernel
+from pgsd_nerfstudio.rendering.compilation import kernel, share_out, workers
 from pgsd_nerfstudio.rendering.projection import (
     DEPTH,
     DIMMING,
@@ -15,6 +14,7 @@ from pgsd_nerfstudio.rendering.projection import (
     RED,
     SHEAR,
     SMEAR,
+    Lens,
     X,
     Y,
     covariance,
@@ -146,8 +146,26 @@ def _project_one_backward(
         to_means[i, n] = viewmat[0, n] * g_x + viewmat[1, n] * g_y + viewmat[2, n] * g_z
 
 
-@parallel_kernel()
 def project_backward(
+    means: np.ndarray,  # [n, 3] float32
+    quats: np.ndarray,  # [n, 4] float32
+    scales: np.ndarray,  # [n, 3] float32
+    motions: np.ndarray,  # [n, 3] or [0, 3] float32
+    viewmat: np.ndarray,  # [4, 4] float64
+    lens: Lens,
+    ids: np.ndarray,  # [m] int32: the Gaussian of each splat
+    splats: np.ndarray,  # [m, 16] float32
+    gradients: np.ndarray,  # [m, 10] float32: of the splats
+    *found: np.ndarray,  # float32, of means, quats, scales, opacities, colours, motions; rows not in `ids` stay as they are
+) -> None:
+    """Write the gradients of the Gaussians from those of their splats."""
+    share_out(_project_backward, workers(), means, quats, scales, motions, viewmat, lens, ids, splats, gradients, *found)
+
+
+@kernel()
+def _project_backward(
+    worker,
+    workers,
     means,
     quats,
     scales,
@@ -164,13 +182,8 @@ def project_backward(
     to_colors,
     to_motions,
 ):
-    """Gradients of the Gaussians from those of their splats.
-
-    `splats` [m, 16] and `gradients` [m, 10] float32 belong to the Gaussians `ids` [m]; other rows of the last six arrays stay
-    as they are.
-    """
-    moves = motions.shape[0] > 0
-    for m in prange(ids.shape[0]):
+    n, moves = ids.shape[0], motions.shape[0] > 0
+    for m in range(n * worker // workers, n * (worker + 1) // workers):
         i = ids[m]
         to_opacities[i] = gradients[m, OPACITY] * splats[m, DIMMING]
         for channel in range(3):
