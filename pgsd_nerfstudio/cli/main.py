@@ -5,7 +5,6 @@ Exit codes: 0 done, 1 could not (one sentence on stderr), 2 wrong usage, or a fi
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
