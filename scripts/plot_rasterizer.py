@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from pgsd_nerfstudio.cli.records import Record, read_records
 
@@ -17,7 +18,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 ROW = re.compile(r"(forward\+backward|forward), (exact|layers (\d+)), (\d+x\d+), ([\d.]+)k frozen, ([\d.]+)k dynamic")
 
 
-def draw(rows: list[Record]) -> plt.Figure:
+def draw(rows: list[Record]) -> Figure:
     """Left: layers trade error for time. Right: what frozen and dynamic Gaussians cost, exact and in layers."""
     figure, (trade, growth) = plt.subplots(1, 2, figsize=(12, 4.6), constrained_layout=True)
     found = [(row, match) for row in rows if (match := ROW.fullmatch(row.name)) and match[1] == "forward+backward"]

@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -59,7 +60,7 @@ def bench(quick: bool) -> list[Record]:
                 more = {"threads": 2, "sweep": (4, 8, 16, 32, 64)} if (n, m) == (150_000, 50_000) else {}
                 rows += costs(case, tries=3 if quick else 7, window=32, **more)
     whole = Case(view_into_yard(96, 64) if quick else view_into_yard(648, 420), yard(80_000), yard_flakes(20_000))
-    return [*rows, against_torch(whole), *_compilation(quick)]
+    return [*rows, out_of_sight(whole, 25_000 if quick else 250_000), against_torch(whole), *_compilation(quick)]
 
 
 def costs(case: Case, *, tries: int, window: int, threads: int = 1, sweep: tuple[int, ...] = ()) -> list[Record]:
@@ -148,6 +149,20 @@ def _timed(
             Record.judged(name, one / several, "times faster", ">= 1.6", error=gradient, error_unit="relative L2", source=why)
         )
     return rows
+
+
+def out_of_sight(case: Case, n: int) -> Record:
+    """What dynamic Gaussians cost that no pixel shows: all behind the camera."""
+    flakes = yard_flakes(n)
+    behind = replace(flakes, means=flakes.means + torch.tensor([0.0, -20.0, 0.0]))
+    rasterizer, leaf, weights = CpuRasterizer(case.frozen), leaves(behind), weights_for(case.cameras)
+    value = least(lambda: rasterizer.render(case.cameras, leaf).rgb.backward(weights), 7)
+    alone, found = (rasterizer.render(case.cameras, moving).rgb for moving in (None, behind))
+    size, error = f"{case.cameras.width}x{case.cameras.height}", (found - alone).abs().max().item()
+    source = "forward+backward, one thread, least of 7; the picture is that of the frozen scene"
+    return Record(
+        f"{n / 1e3:g}k dynamic behind the camera, {size}", value, "ms CPU", error, "largest difference", source=source
+    )
 
 
 def against_torch(case: Case) -> Record:

@@ -41,6 +41,7 @@ class WeatherTrainer(Trainer):
             )
             return
         config = self.config.get_base_dir() / "config.yml"
-        CONSOLE.print(f"Frozen scene while training: {self.pipeline.model.stage.clip_rasterizer.memory}", soft_wrap=True)
+        stage: Any = self.pipeline.model.stage
+        CONSOLE.print(f"Frozen scene while training: {stage.clip_rasterizer.memory}", soft_wrap=True)
         CONSOLE.print(f"Look at it: ns-viewer --load-config {config}", soft_wrap=True)
         CONSOLE.print(f"A video: ns-render interpolate --load-config {config} --output-path snow.mp4", soft_wrap=True)

@@ -96,8 +96,11 @@ class _RenderMerged(torch.autograd.Function):
         image = frozen.image.copy()
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
-        blend = blend_layered if isinstance(frozen.part, Layers) else blend_merged
-        blend(frozen.part, dynamic, width, height, *limits, image)
+        scene = dynamic, width, height, *limits, image
+        if isinstance(frozen.part, Layers):
+            blend_layered(frozen.part, *scene)
+        else:
+            blend_merged(frozen.part, *scene)
         ctx.save_for_backward(*tensors)
         ctx.walk = _Walk(view, frozen.part, dynamic, ids, limits, image)
         return torch.from_numpy(image)
@@ -115,8 +118,11 @@ def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tens
     view, part, dynamic, ids, limits, image = walk
     lens = view.lens
     to_splats = np.zeros((workers(), len(ids), GRADIENT_COLUMNS), np.float32)
-    back = blend_layered_backward if isinstance(part, Layers) else blend_backward
-    back(part, dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats)
+    scene = dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats
+    if isinstance(part, Layers):
+        blend_layered_backward(part, *scene)
+    else:
+        blend_backward(part, *scene)
     means, quats, scales = (float_array(tensor) for tensor in (gaussians.means, gaussians.quats, gaussians.scales))
     motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
     found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]

@@ -57,8 +57,16 @@ def motions_array(gaussians: Gaussians) -> np.ndarray:
 def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
     """The Gaussians on the image plane of a camera, and which of them each splat is (int32)."""
     splats = np.empty((len(gaussians), COLUMNS), np.float32)
-    shapes = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    project(*(float_array(t) for t in shapes), motions_array(gaussians), view.viewmat, view.lens, splats)
+    project(
+        float_array(gaussians.means),
+        float_array(gaussians.quats),
+        float_array(gaussians.scales),
+        float_array(gaussians.opacities),
+        motions_array(gaussians),
+        view.viewmat,
+        view.lens,
+        splats,
+    )
     ids = visible_by_depth(splats)
     visible = splats[ids]
     if gaussians.colors.ndim == 2:
