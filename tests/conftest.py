@@ -50,6 +50,14 @@ def splatfacto_run(tmp_path_factory: pytest.TempPathFactory, garden_ply: Path, g
     return write_splatfacto_run(tmp_path_factory.mktemp("outputs"), garden_ply, garden_data)
 
 
+@pytest.fixture(scope="session")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A dark floor of 6 x 6 m as a splat, and eight views of it from a ring: (the .ply, the folder of transforms.json)."""
+    from yard_scene import write_yard
+
+    return write_yard(tmp_path_factory.mktemp("yard"))
+
+
 def _existing(path: Path) -> Path:
     if not path.exists():
         pytest.skip(f"needs ../{path.relative_to(ROOT.parent)}")

@@ -1,55 +1,11 @@
 """Laws of `pgsd preview`: what a new user tries first says clearly what is wrong, and shows the scene with weather in it."""
 
-import json
-import math
-
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from pgsd_nerfstudio.cli.main import run
-
-FIELDS = [
-    "x",
-    "y",
-    "z",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    *(f"scale_{i}" for i in range(3)),
-    *(f"rot_{i}" for i in range(4)),
-]
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory):
-    """A dark floor of 6 x 6 m as a splat, and eight views of it from a ring: (the .ply, the folder of transforms.json)."""
-    folder = tmp_path_factory.mktemp("yard")
-    side = np.linspace(-3, 3, 50, dtype=np.float32)
-    points = np.zeros(side.size**2, dtype=[(name, "f4") for name in FIELDS])
-    points["x"], points["y"] = (axis.ravel() for axis in np.meshgrid(side, side))
-    points["f_dc_0"] = points["f_dc_1"] = points["f_dc_2"] = (0.1 - 0.5) / 0.28209479
-    points["opacity"], points["rot_0"] = 6.0, 1.0
-    points["scale_0"] = points["scale_1"] = math.log(0.08)
-    points["scale_2"] = math.log(0.005)
-    PlyData([PlyElement.describe(points, "vertex")]).write(str(folder / "yard.ply"))
-    frames = [{"file_path": f"images/{i}.jpg", "transform_matrix": look_inward(i * math.pi / 4).tolist()} for i in range(8)]
-    capture = {"w": 96, "h": 64, "fl_x": 80.0, "fl_y": 80.0, "cx": 48.0, "cy": 32.0, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(capture))
-    return folder / "yard.ply", folder
-
-
-def look_inward(azimuth: float) -> np.ndarray:
-    """Camera to world (OpenGL) at 4 m from the middle and 1.5 m above the floor."""
-    center = np.array([4 * math.cos(azimuth), 4 * math.sin(azimuth), 1.5])
-    back = center / np.linalg.norm(center)
-    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, center], axis=1)
-    return pose
 
 
 def preview(yard, output, **flags) -> int:

@@ -14,10 +14,12 @@ import tyro
 from pgsd_nerfstudio.cli.bench import Bench
 from pgsd_nerfstudio.cli.preview import Preview
 from pgsd_nerfstudio.cli.refusal import Refusal
+from pgsd_nerfstudio.cli.simulate import Simulate
 from pgsd_nerfstudio.cli.verify import Verify
 
 Command = (
     Annotated[Preview, tyro.conf.subcommand("preview")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
 )

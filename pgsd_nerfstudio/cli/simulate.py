@@ -1,0 +1,116 @@
+"""`pgsd simulate`: the motion prior by itself, with a report of what happened."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pgsd_nerfstudio.cli.preview import open_scene, say
+from pgsd_nerfstudio.cli.refusal import Refusal, refusing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pgsd_nerfstudio.weather import Effect
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Simulate a weather in a scene, physics only. Interrupted, it goes on where it was; ns-train finds the result."""
+
+    load_scene: str
+    """A splatfacto run (folder, config.yml or .ckpt), a 3DGS .ply (then with --data), or the word demo."""
+    data: Path | None = None
+    """Folder of transforms.json, or the file; a .ply needs it for its cameras."""
+    effect: str = "snowfall"
+    """Which weather."""
+    intensity: float | None = None
+    """Precipitation in mm/h of water (light snow below 1, heavy above 2.5); by default the effect's own."""
+    seconds: float = 10.0
+    """Length of the weather."""
+    fps: float = 25.0
+    """Frames per second."""
+    max_particles: int | None = None
+    """Most particles in the air at once, each standing for several real ones; by default 20,000."""
+    seed: int = 0
+    """Seed of everything random."""
+    metres_per_unit: float | None = None
+    """Length of a scene unit in metres; estimated from the cameras' height above the ground if not given."""
+    output: Path = Path("simulation")
+    """Folder for report.json and report.png."""
+
+    def run(self) -> int:
+        from pgsd_nerfstudio.physics import Clock, motion_prior
+        from pgsd_nerfstudio.physics.report import report
+        from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+        from pgsd_nerfstudio.surface.mesh import surface_of
+
+        for name in ("seconds", "fps", "max_particles"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise Refusal(f"--{name.replace('_', '-')} must be positive, got {value:g}")
+        with refusing(OSError):
+            self.output.mkdir(parents=True, exist_ok=True)
+        began = time.perf_counter()
+        with refusing(ValueError, FileNotFoundError, OSError):
+            effect = self._effect()
+            scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
+            say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
+            surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"))
+            clock = Clock(self.fps, max(2, round(self.seconds * self.fps)))
+            history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=self.max_particles)
+        found = report(history, effect.material)
+        found["scale"] = {"metres_per_unit": scene.frame.metres_per_unit, "source": scene.frame.source}
+        found["wall_seconds"] = time.perf_counter() - began
+        # Kilobytes on Linux, bytes on macOS.
+        found["peak_memory_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+            1 if sys.platform == "darwin" else 1024
+        )
+        paths = self.output / "report.json", self.output / "report.png"
+        with refusing(OSError):
+            paths[0].write_text(json.dumps(found, indent=1) + "\n")
+            draw(found).savefig(paths[1], dpi=110)
+        print(*paths, sep="\n")
+        return 0
+
+    def _effect(self) -> Effect:
+        from pgsd_nerfstudio.weather import effect
+
+        chosen = effect(self.effect)
+        if self.intensity is None:
+            return chosen
+        return dataclasses.replace(chosen, emission=dataclasses.replace(chosen.emission, intensity=self.intensity))
+
+
+def draw(found: dict[str, Any]) -> Figure:
+    """Counts, mass, momentum and energy over the time of a report."""
+    from matplotlib.figure import Figure
+
+    rows, seconds = found["per_frame"], [frame / found["fps"] for frame in range(found["frames"])]
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    (counts, masses), (momentum, energy) = figure.subplots(2, 2, sharex=True)
+    counts.plot(seconds, rows["in_air"], label="in the air")
+    counts.plot(seconds, rows["resting"], label="resting")
+    counts.set_ylabel("simulated particles")
+    masses.plot(seconds, rows["mass_in_air"], label="in the air")
+    masses.plot(seconds, rows["mass_resting"], label="resting")
+    masses.set_ylabel("mass, kg")
+    for axis, name in enumerate("xyz"):
+        momentum.plot(seconds, [value[axis] for value in rows["momentum"]], label=name)
+    momentum.set_ylabel("momentum in the air, kg m/s")
+    energy.plot(seconds, rows["kinetic_energy"], label="kinetic, in the air")
+    energy.set_ylabel("energy, J")
+    for axes in (counts, masses, momentum, energy):
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    for axes in (momentum, energy):
+        axes.set_xlabel("time, s")
+    lost = f"mass emitted {found['mass_emitted']:.4g} kg, lost {found['mass_lost']:.2g} kg"
+    figure.suptitle(f"{found['about'].get('effect', 'weather')}: {found['particles']:,} particles, {lost}")
+    return figure
