@@ -173,7 +173,6 @@ class WeatherPipeline(VanillaPipeline):
             console.print(f"[yellow]step {step} gives no gradient: {error}[/]")
             return DistilledClip(torch.zeros_like(clip), 0.0, 0)
         self._skipped = 0
-        self._layers_judged = False
         return distilled
 
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
