@@ -8,6 +8,7 @@ import roma
 import torch
 from dynamics_particles import double, falling, rollout
 
+from pgsd_nerfstudio.dynamics import Rollout
 from pgsd_nerfstudio.dynamics import rollout as rollout_module
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND
 from pgsd_nerfstudio.dynamics.state import LANDING_FRAMES
@@ -38,6 +39,22 @@ def test_untrained_field_reproduces_the_simulation_bit_for_bit():
     # With gradient nothing is skipped: the networks run, and their zeros must change no bit.
     for rolled in roll.window(0, len(roll)):
         assert_is_simulation(roll, rolled.gaussians, rolled.frame)
+
+
+def test_an_open_shutter_shows_how_far_each_particle_flies_in_that_time():
+    """On straight lines: exposure times velocity, which is the step from frame to frame times the frame rate."""
+    history = falling()
+    still = rollout(history)
+    assert still.gaussians(12).displacements is None
+    open_shutter = Rollout(history, still.look, still.field, exposure=0.02)
+    for frame in (0, 12, len(open_shutter) - 1):
+        gaussians, active = open_shutter.gaussians(frame), history.active(frame)
+        for k, particle in enumerate(active.tolist()):
+            rows = history.positions[history.offsets[particle] : history.offsets[particle + 1]]
+            velocity = (rows[1] - rows[0]) * history.fps if len(rows) > 1 else torch.zeros(3)
+            assert torch.allclose(gaussians.displacements[k], 0.02 * velocity, atol=1e-5)
+        assert not gaussians.displacements[len(active) :].any()
+    assert torch.equal(open_shutter.gaussians(12).means, still.gaussians(12).means)
 
 
 def test_untrained_field_costs_nothing_without_gradient(monkeypatch):

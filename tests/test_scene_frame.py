@@ -70,8 +70,10 @@ def test_gaussians_keep_their_shape_in_scene_units():
     frame, generator = some_frame(), torch.Generator().manual_seed(1)
     quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=generator), dim=1)
     scales = torch.rand(20, 3, generator=generator) + 0.1
-    metric = Gaussians(torch.randn(20, 3, generator=generator), quats, scales, torch.rand(20), torch.rand(20, 3))
+    ways = torch.randn(20, 3, generator=generator)
+    metric = Gaussians(torch.randn(20, 3, generator=generator), quats, scales, torch.rand(20), torch.rand(20, 3), ways)
     moved = frame.gaussians_to_scene(metric)
+    assert torch.allclose(moved.displacements, frame.to_scene(metric.means + ways) - moved.means, atol=1e-5)
 
     def covariance(g: Gaussians) -> torch.Tensor:
         axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(g.quats)) * g.scales[:, None, :]

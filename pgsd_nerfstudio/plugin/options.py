@@ -72,7 +72,8 @@ class WeatherOptions:
     (whose straight way through a ring of views leads across its middle within a third of a second)."""
     layers: int | None = None
     """Without a GPU: press the frozen scene behind every 16x16 pixels into so many layers, which makes training frames faster
-    at a small error (64 for 96x64 pixels, 16 for larger ones; the error is printed); by default exact."""
+    at a small error (64 for 96x64 pixels, 16 for larger ones). The error, larger where weather lies on surfaces than where it
+    flies, is printed with the first clip; by default exact."""
     refresh_every: int = 50
     """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
     clip_frames: int | None = None
