@@ -12,7 +12,7 @@ from pgsd_nerfstudio.physics.simulate import simulate
 from pgsd_nerfstudio.plugin.clip import render_clip, seen_by, surrogate
 from pgsd_nerfstudio.plugin.run_cameras import open_scene
 from pgsd_nerfstudio.plugin.stage import Stage
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather import effect, initial_look

@@ -9,7 +9,7 @@ import open3d as o3d
 import pytest
 import torch
 
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.demo import build, demo_depth, demo_hits, demo_mesh, demo_scene
 from pgsd_nerfstudio.scene.scene import Scene

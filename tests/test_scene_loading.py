@@ -12,7 +12,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.capture import in_run, read_capture
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import SceneError

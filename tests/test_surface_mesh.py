@@ -11,7 +11,7 @@ import torch
 from rounds import pixel_rays, round_of
 
 import pgsd_nerfstudio.surface.mesh as mesh_module
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians

@@ -138,7 +138,7 @@ class Preview:
 
         from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
         from pgsd_nerfstudio.physics import MAX_PARTICLES, Clock, motion_prior
-        from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+        from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
         from pgsd_nerfstudio.weather import initial_look
 

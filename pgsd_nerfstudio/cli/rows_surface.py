@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.cli.records import Record
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.demo import demo_depth, demo_scene
 from pgsd_nerfstudio.scene.frame import attention

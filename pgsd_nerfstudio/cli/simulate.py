@@ -48,7 +48,7 @@ class Simulate:
     def run(self) -> int:
         from pgsd_nerfstudio.physics import Clock, motion_prior
         from pgsd_nerfstudio.physics.report import report
-        from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+        from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
 
         for name in ("seconds", "fps", "max_particles"):

@@ -29,7 +29,8 @@ from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.splat import splat_tensors
 from pgsd_nerfstudio.plugin.stage import Stage
-from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering, choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import initial_look

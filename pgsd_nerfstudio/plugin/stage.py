@@ -10,7 +10,8 @@ import torch
 
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.run_cameras import open_scene
-from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.rendering.rasterizer import Rasterizer
 from pgsd_nerfstudio.scene.scene import Scene
 
 

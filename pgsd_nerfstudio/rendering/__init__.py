@@ -12,6 +12,7 @@
 (torch.Size([1, 32, 32, 3]), 2.0)
 """
 
-from pgsd_nerfstudio.rendering.rasterizer import RasterConfig, Rasterizer, Rendering, choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.rendering.rasterizer import RasterConfig, Rasterizer, Rendering
 
 __all__ = ["RasterConfig", "Rasterizer", "Rendering", "choose_rasterizer"]

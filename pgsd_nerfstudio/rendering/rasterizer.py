@@ -133,23 +133,3 @@ def composite(
     if background is not None:
         color = color + (1.0 - accumulation)[..., None] * background.to(color)
     return Rendering(color, weighted_depth / accumulation.clamp_min(1e-10), accumulation)
-
-
-def choose_rasterizer(frozen: Gaussians, device: torch.device | str, layers: int | None = None) -> Rasterizer:
-    """The rasterizer for a device: numba on the CPU, gsplat with CUDA; the frozen Gaussians are moved there.
-
-    Raises:
-        ValueError: there is no rasterizer for the device, or `layers` (see CpuRasterizer) are asked of another than the CPU's.
-    """
-    kind = torch.device(device).type
-    if layers is not None and kind != "cpu":
-        raise ValueError(f"layers are an option of the rasterizer for the CPU, found layers={layers} on {device}")
-    if kind == "cuda":
-        from pgsd_nerfstudio.rendering.cuda import GsplatRasterizer
-
-        return GsplatRasterizer(frozen.to(device))
-    if kind == "cpu":
-        from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
-
-        return CpuRasterizer(frozen.to("cpu"), layers=layers)
-    raise ValueError(f"there are rasterizers for the devices cpu and cuda, found {device}")

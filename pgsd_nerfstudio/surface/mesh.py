@@ -17,7 +17,8 @@ from jaxtyping import Float, Int
 from rich.progress import track
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.rendering.rasterizer import Rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import attention
 from pgsd_nerfstudio.scene.gaussians import Gaussians

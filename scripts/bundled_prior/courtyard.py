@@ -17,7 +17,7 @@ from bundled_prior.families import FRAMES, HEIGHT, WIDTH, Family, draw_looks
 from bundled_prior.looks import DEMO_SCENE, Look
 from pgsd_nerfstudio.physics import Clock, ParticleHistory, simulate
 from pgsd_nerfstudio.physics.clock import domain_of
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.scene.gaussians import Gaussians

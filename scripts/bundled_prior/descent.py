@@ -21,7 +21,7 @@ from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.guidance import DistillationConfig, VideoPrior, distill_clip
 from pgsd_nerfstudio.physics import Clock, simulate
 from pgsd_nerfstudio.physics.clock import domain_of
-from pgsd_nerfstudio.rendering.rasterizer import choose_rasterizer
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
