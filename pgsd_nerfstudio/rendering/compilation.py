@@ -1,7 +1,7 @@
 """How the numba kernels of this room are compiled, and run on several threads.
 
-Compiled kernels are kept on disk and made anew when the file they stand in changes, but not when a kernel or a constant from
-another file does: after such a change, delete __pycache__.
+Compiled kernels are kept on disk and made anew when any file of this room changes: they are made of each other and of constants
+from several files, where numba by itself looks only at the file that a kernel stands in.
 
 Threads are Python's own, which run at once since kernels need no interpreter. numba's `parallel=True` would do the same for
 twice the compilation, and its OpenMP threads spin while they wait for those of torch.
@@ -13,6 +13,8 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -22,8 +24,26 @@ from jaxtyping import Float
 # Reordering and fused operations, but comparisons with NaN and infinity keep their meaning (no "nnan", no "ninf").
 _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
-kernel = partial(numba.njit, cache=True, nogil=True, error_model="numpy", fastmath=_MATH)
-"""Decorator of a kernel for one thread."""
+
+def room_stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
+    """Name, time of the last change and size of every source file of a folder."""
+    return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in sorted(folder.glob("*.py")))
+
+
+_STAMP = room_stamp(Path(__file__).parent)
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a kernel for one thread."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        made = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_MATH, **options)(function)
+        # What numba compares with the stamp in its index of compiled functions; it offers no public way to say more.
+        made._cache._cache_file._source_stamp = _STAMP
+        return made
+
+    return decorate
+
 
 inlined = partial(numba.njit, inline="always")
 """Decorator of a piece of a kernel."""
