@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from pgsd_nerfstudio.cli import rows_air_cases
 from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, WindField, simulate
 from pgsd_nerfstudio.physics.airborne import GRAVITY, Flutter, advance
@@ -44,6 +45,7 @@ def verify(quick: bool) -> list[Record]:
         Record.judged(
             "landed particles off the surface", _off_surface(run), "m", "<= 1e-4", source="height of the yard's planes"
         ),
+        *rows_air_cases.cases(quick),
     ]
 
 
@@ -65,6 +67,7 @@ def bench(quick: bool) -> list[Record]:
             f"motion prior of {frames} frames, per particle and frame", 1e9 * seconds / rows, "ns", error, "m", source=against
         ),
         Record(f"motion prior of {frames} frames, {len(run):,} particles", seconds, "s", source="flat yard with a table"),
+        *rows_air_cases.costs(quick),
     ]
 
 

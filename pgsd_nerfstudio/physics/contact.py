@@ -68,7 +68,7 @@ class Ground:
             if len(surface.triangles)
             else np.zeros((0, 3, 3))
         )
-        cells = np.floor((_cover(corners, CELL / 2) - lower) / CELL).astype(int)
+        cells = np.floor((cover(corners, CELL / 2) - lower) / CELL).astype(int)
         cells = cells[((cells >= -BAND) & (cells < np.asarray(shape) + BAND)).all(1)].clip(0, np.asarray(shape) - 1)
         near[tuple(cells.T)] = 1.0
         for axis in range(3):  # a cube grows axis by axis
@@ -173,7 +173,7 @@ def _turned(normal: Float[ndarray, "n 3"], spin: Float[ndarray, "n"]) -> Float[n
     return np.stack([w * c, x * c + y * s, y * c - x * s, w * s], 1).astype(np.float32)
 
 
-def _cover(corners: Float[ndarray, "f 3 3"], spacing: float) -> Float[ndarray, "s 3"]:
+def cover(corners: Float[ndarray, "f 3 3"], spacing: float) -> Float[ndarray, "s 3"]:
     """Points on triangles, no point of a triangle farther than `spacing` from one of them."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1) if len(corners) else np.zeros(0)
     # Triangles of a similar size are sampled together, so that one large one does not refine all the small ones.

@@ -78,7 +78,7 @@ class SurfaceMesh:
         n = len(origins)
         if len(self.triangles) == 0 or n == 0:
             return Hits(torch.full((n,), torch.inf), torch.zeros(n, 3))
-        found = self._raycasting.cast_rays(_queries(origins, directions))
+        found = self.raycasting.cast_rays(queries(origins, directions))
         distance = torch.from_numpy(found["t_hit"].numpy())
         return Hits(distance, self._normals_at(found, torch.isfinite(distance)))
 
@@ -88,8 +88,8 @@ class SurfaceMesh:
             points = torch.as_tensor(points, dtype=torch.float32).cpu()
             up = torch.tensor([0.0, 0.0, 1.0]).repeat(len(points), 1)
             return Closest(points.clone(), up, torch.full((len(points),), torch.inf))
-        query = _queries(points)
-        found = self._raycasting.compute_closest_points(query)
+        query = queries(points)
+        found = self.raycasting.compute_closest_points(query)
         nearest = torch.from_numpy(found["points"].numpy())
         distance = (nearest - torch.from_numpy(query.numpy())).norm(dim=1)
         return Closest(nearest, self._normals_at(found, torch.ones(len(nearest), dtype=torch.bool)), distance)
@@ -103,7 +103,8 @@ class SurfaceMesh:
         return torch.nn.functional.normalize(total, dim=1)
 
     @cached_property
-    def _raycasting(self) -> Any:
+    def raycasting(self) -> Any:
+        """Open3D's scene of the triangles, for rays and distances."""
         o3d = open3d()
         scene = o3d.t.geometry.RaycastingScene()
         triangles = np.ascontiguousarray(self.triangles.numpy().astype(np.uint32))
@@ -235,7 +236,7 @@ def _fuse_within(
         fusion = replace(fusion, voxel=fusion.voxel * 1.05 * (len(triangles) / budget) ** 0.5)
 
 
-def _queries(*parts: Float[Tensor, "n 3"]) -> Any:
+def queries(*parts: Float[Tensor, "n 3"]) -> Any:
     """Points, or origins and directions, as Open3D takes them."""
     columns = [torch.as_tensor(part).detach().float().cpu() for part in parts]
     return open3d().core.Tensor(torch.cat(columns, dim=1).contiguous().numpy())
