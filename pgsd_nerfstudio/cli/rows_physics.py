@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -46,6 +47,7 @@ def verify(quick: bool) -> list[Record]:
             "landed particles off the surface", _off_surface(run), "m", "<= 1e-4", source="height of the yard's planes"
         ),
         *rows_air_cases.cases(quick),
+        *_dense(quick, "cases"),
     ]
 
 
@@ -68,7 +70,17 @@ def bench(quick: bool) -> list[Record]:
         ),
         Record(f"motion prior of {frames} frames, {len(run):,} particles", seconds, "s", source="flat yard with a table"),
         *rows_air_cases.costs(quick),
+        *_dense(quick, "costs"),
     ]
+
+
+def _dense(quick: bool, kind: Literal["cases", "costs"]) -> list[Record]:
+    """Rows of the material point method; not in --quick, where compiling its kernels alone would take the time of all."""
+    if quick:
+        return []
+    from pgsd_nerfstudio.cli import rows_mpm_cases  # starts Taichi
+
+    return rows_mpm_cases.cases(False) if kind == "cases" else rows_mpm_cases.costs(False)
 
 
 _DRAG = "v = v_t + (v_0 - v_t) exp(-t g / v_t)"

@@ -1,0 +1,88 @@
+"""Where things lie in memory: one row per particle, one row per grid node, nodes in blocks of 4 x 4 x 4.
+
+A particle's row is read and written as a whole, so it is one piece of memory. Positions are relative to the lower corner of
+the domain, where single precision is finest. Node (i, j, k) lies at ((i, j, k) - MARGIN) * dx from that corner; its row
+number is a sum of one term per axis (`axis_terms`), so that a stencil of 27 nodes needs 9 terms.
+"""
+
+import taichi as ti
+
+# Columns of a particle.
+X, V = 0, 3  # position, velocity
+C = 6  # affine velocity, 1/s (row by row)
+F = 15  # elastic deformation gradient
+TAU = 24  # Kirchhoff stress times volume, J
+J = 33  # water: volume ratio; snow: plastic volume ratio; sand: volume correction
+VOLUME, MASS = 34, 35
+ENERGY = 36  # elastic, J
+WIDTH = 37
+
+# Columns of a particle's whole numbers.
+MATERIAL, STATE, QUIET, BLOCK = 0, 1, 2, 3
+TAGS = 4
+ACTIVE, RESTING, REMOVED = 1, 2, 3
+
+# Columns of a grid node: mass, then momentum (after `scatter`) or velocity (after `move_nodes`).
+NODE = 4
+WALL = 5  # columns of each part of an obstacle at a node: distance, outward normal, friction
+STICKS = 1e6  # friction from which matter cannot leave either
+EDGE = 4  # nodes along a block
+CELLS = EDGE**3
+MARGIN = 2  # nodes outside the domain on each side: the stencil of a particle at the very edge
+
+Array1 = ti.types.ndarray(ndim=1)
+Array2 = ti.types.ndarray(ndim=2)
+
+
+@ti.func
+def read3(rows: ti.template(), p, column: ti.template()):
+    """A vector from a particle's or node's row."""
+    return ti.Vector([rows[p, column + i] for i in ti.static(range(3))])
+
+
+@ti.func
+def write3(rows: ti.template(), p, column: ti.template(), value):
+    for i in ti.static(range(3)):
+        rows[p, column + i] = value[i]
+
+
+@ti.func
+def read33(rows: ti.template(), p, column: ti.template()):
+    """A matrix from a particle's row."""
+    return ti.Matrix([[rows[p, column + 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
+
+
+@ti.func
+def write33(rows: ti.template(), p, column: ti.template(), value):
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        rows[p, column + 3 * i + j] = value[i, j]
+
+
+@ti.func
+def base_node(position, inv_dx):
+    """Lowest of the 3 x 3 x 3 nodes around a position."""
+    return ti.cast(ti.floor(position * inv_dx - 0.5), ti.i32) + MARGIN
+
+
+@ti.func
+def block_of(base, by, bz):
+    return ((base[0] >> 2) * by + (base[1] >> 2)) * bz + (base[2] >> 2)
+
+
+@ti.func
+def axis_terms(base, by, bz):
+    """Terms whose sum over the axes is the row of a node: terms[axis, offset]."""
+    terms = ti.Matrix.zero(ti.i32, 3, 3)
+    for o in ti.static(range(3)):
+        i, j, k = base[0] + o, base[1] + o, base[2] + o
+        terms[0, o] = (i >> 2) * by * bz * CELLS + (i & 3) * 16
+        terms[1, o] = (j >> 2) * bz * CELLS + (j & 3) * 4
+        terms[2, o] = (k >> 2) * CELLS + (k & 3)
+    return terms
+
+
+@ti.func
+def node_of(row, by, bz):
+    """The node (i, j, k) of a row."""
+    b, q = row // CELLS, row % CELLS
+    return ti.Vector([(b // (by * bz)) * 4 + q // 16, ((b // bz) % by) * 4 + (q // 4) % 4, (b % bz) * 4 + q % 4])
