@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError, fields, is_dataclass
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
 
@@ -44,3 +44,12 @@ def test_configuration_is_plain_and_frozen():
     walk(SNOWFALL)
     with pytest.raises(FrozenInstanceError):
         SNOWFALL.name = "x"  # type: ignore[misc]
+
+
+def test_knobs_turn_one_number_and_leave_the_rest():
+    plain, turned = effect("snowfall"), effect("snowfall", intensity=2.5, exposure=0.02)
+    assert turned.emission.intensity == 2.5 and turned.appearance.exposure == 0.02
+    assert replace(turned, emission=plain.emission, appearance=plain.appearance) == plain
+    assert effect("snowfall") is plain
+    with pytest.raises(ValueError, match=r"exposure must lie in 0-1 s, got 2"):
+        effect("snowfall", exposure=2.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -61,11 +60,12 @@ class Preview:
         from rich.progress import track
 
         from pgsd_nerfstudio.cli.video import write_picture, write_video
+        from pgsd_nerfstudio.weather import effect as weather_effect
 
         self._check()
         began = time.perf_counter()
         with refusing(ValueError, FileNotFoundError):
-            effect = self._effect()
+            effect = weather_effect(self.effect, intensity=self.intensity, exposure=self.exposure)
             say(f"opening {self.load_scene}")
             scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
             cameras = self._cameras(scene)
@@ -104,16 +104,6 @@ class Preview:
             self.output.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise Refusal(f"{self.output} cannot be written ({error.strerror}); choose another --output") from error
-
-    def _effect(self) -> Effect:
-        from pgsd_nerfstudio.weather import effect
-
-        chosen = effect(self.effect)
-        if self.intensity is not None:
-            chosen = dataclasses.replace(chosen, emission=dataclasses.replace(chosen.emission, intensity=self.intensity))
-        if self.exposure is not None:
-            chosen = dataclasses.replace(chosen, appearance=dataclasses.replace(chosen.appearance, exposure=self.exposure))
-        return chosen
 
     @property
     def _first(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import resource
 import sys
@@ -16,8 +15,6 @@ from pgsd_nerfstudio.cli.refusal import Refusal, refusing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from pgsd_nerfstudio.weather import Effect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +47,7 @@ class Simulate:
         from pgsd_nerfstudio.physics.report import report
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
+        from pgsd_nerfstudio.weather import effect as weather_effect
 
         for name in ("seconds", "fps", "max_particles"):
             value = getattr(self, name)
@@ -59,7 +57,7 @@ class Simulate:
             self.output.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
         with refusing(ValueError, FileNotFoundError, OSError):
-            effect = self._effect()
+            effect = weather_effect(self.effect, intensity=self.intensity)
             scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
             say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
             surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"))
@@ -78,14 +76,6 @@ class Simulate:
             draw(found).savefig(paths[1], dpi=110)
         print(*paths, sep="\n")
         return 0
-
-    def _effect(self) -> Effect:
-        from pgsd_nerfstudio.weather import effect
-
-        chosen = effect(self.effect)
-        if self.intensity is None:
-            return chosen
-        return dataclasses.replace(chosen, emission=dataclasses.replace(chosen.emission, intensity=self.intensity))
 
 
 def draw(found: dict[str, Any]) -> Figure:

@@ -7,7 +7,7 @@ minutes, with CUDA it follows the paper.
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -136,14 +136,9 @@ class WeatherOptions:
         from pgsd_nerfstudio.weather import effect
 
         try:
-            chosen = effect(self.effect)
-            if self.intensity is not None:
-                chosen = replace(chosen, emission=replace(chosen.emission, intensity=self.intensity))
-            if self.exposure is not None:
-                chosen = replace(chosen, appearance=replace(chosen.appearance, exposure=self.exposure))
+            return effect(self.effect, intensity=self.intensity, exposure=self.exposure)
         except ValueError as error:
             raise RunError(str(error)) from error
-        return chosen
 
     def command(self) -> str:
         """The ns-train command that makes this run's motion prior again."""

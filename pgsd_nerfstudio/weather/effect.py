@@ -7,7 +7,7 @@ Lengths in metres, speeds in m/s, seconds, unless a name says otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,12 +155,17 @@ def register(new: Effect) -> Effect:
     return new
 
 
-def effect(name: str) -> Effect:
-    """The effect of that name.
+def effect(name: str, *, intensity: float | None = None, exposure: float | None = None) -> Effect:
+    """The effect of that name, with another intensity (mm/h of water) or shutter time (seconds) if given.
 
     Raises:
-        ValueError: there is none; the message names the known ones.
+        ValueError: there is none, then the message names the known ones; or a number is out of its range.
     """
     if name not in EFFECTS:
         raise ValueError(f"there is no effect {name!r}; known are: {', '.join(sorted(EFFECTS))}")
-    return EFFECTS[name]
+    chosen = EFFECTS[name]
+    if intensity is not None:
+        chosen = replace(chosen, emission=replace(chosen.emission, intensity=intensity))
+    if exposure is not None:
+        chosen = replace(chosen, appearance=replace(chosen.appearance, exposure=exposure))
+    return chosen
