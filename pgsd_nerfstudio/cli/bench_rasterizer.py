@@ -7,9 +7,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.timing import least
 from pgsd_nerfstudio.cli.yard import middle, view_into_yard, yard, yard_flakes
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rendering
@@ -250,27 +248,3 @@ def _errors(case: Case, rasterizer: CpuRasterizer) -> tuple[float, float]:
 
 def psnr(found: Tensor, expected: Tensor) -> float:
     return -10.0 * math.log10(max((found.double() - expected.double()).square().mean().item(), 1e-20))
-
-
-@contextmanager
-def on_threads(count: int) -> Iterator[None]:
-    usual = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(usual)
-
-
-def least(work: Callable[[], object], tries: int, *, threads: int = 1, wall: bool = False, warm: bool = True) -> float:
-    """Milliseconds of CPU time, or of the clock: the least of several tries, since what others do on the machine only adds."""
-    clock = time.perf_counter if wall else time.process_time
-    times = []
-    with on_threads(threads):
-        if warm:
-            work()
-        for _ in range(tries):
-            began = clock()
-            work()
-            times.append(clock() - began)
-    return 1e3 * min(times)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.physics.airborne import Flutter, advance
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.fall_speeds import (
@@ -162,7 +163,7 @@ def _flight(quick: bool) -> list[Record]:
         velocity = np.zeros_like(position)
         velocity[:, 2] = -speed
         few = position[:200].copy(), velocity[:200].copy(), speed[:200].copy()
-        seconds = _best(
+        seconds = best(
             lambda p=position, v=velocity, s=speed, f=flutter: advance(p, v, s, f, wind, 0.3, 0.04), 3 if quick else 20
         )
         rows.append(
@@ -202,7 +203,7 @@ def _distance(quick: bool) -> list[Record]:
     wrong = float((np.sign(grid.values) != np.sign(truth))[np.abs(truth) > cell].mean())
     size = f"{len(mesh.triangles):,} triangles of a ball, 5 % missing and 30 % flipped, {grid.asked:,} of its points asked"
     points = np.random.default_rng(0).uniform([-0.9, -0.9, -0.2], [0.9, 0.9, 1.6], (100_000, 3))
-    sampling = _best(lambda: grid.sample(points), 3)
+    sampling = best(lambda: grid.sample(points), 3)
     off = np.linalg.norm(points - center, axis=1) - 0.5
     in_band = np.abs(off) < grid.band - 2 * cell
     paid = float(np.median(np.abs(grid.sample(points)[0] - off)[in_band]))
@@ -220,7 +221,7 @@ def _wetting(quick: bool) -> list[Record]:
     grid.deposit(points, water)
     grid.step(0.04)
     times = 3 if quick else 20
-    depositing, stepping = _best(lambda: grid.deposit(points, water), times), _best(lambda: grid.step(0.04), times)
+    depositing, stepping = best(lambda: grid.deposit(points, water), times), best(lambda: grid.step(0.04), times)
     error = abs(grid.held + grid.evaporated - grid.deposited) / grid.deposited
     size = f"{len(grid):,} cells of 5 cm around a yard of 16 m^2 with a table, {grid.bytes / len(grid):.0f} bytes a cell"
     return [
@@ -247,13 +248,3 @@ def _damaged_ball(center: np.ndarray, radius: float) -> SurfaceMesh:
     triangles = np.where(rng.uniform(size=len(triangles))[:, None] < 0.3, triangles[:, ::-1], triangles)
     kept = triangles[rng.uniform(size=len(triangles)) >= 0.05]
     return SurfaceMesh(torch.from_numpy(center + radius * unit).float(), torch.from_numpy(kept.copy()).int())
-
-
-def _best(call, times: int) -> float:
-    """Seconds of the fastest of several calls, which is the one that others on the machine disturbed least."""
-    seconds = []
-    for _ in range(times + 1):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, RegularizationWeights, Rollout, regularization
 from pgsd_nerfstudio.dynamics.regularizers import rotation_angle
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate
@@ -77,9 +76,9 @@ def bench(quick: bool) -> list[Record]:
     error = _float_error(roll)
     unit = {"error": error, "error_unit": "m, float32 against float64 over the sequence"}
     untrained = _rollout(history, weights=0.0)
-    frame = _best(lambda: roll.window(start, 1))
-    clip = _best(lambda: _train(roll, start))
-    shown = _best(lambda: untrained.gaussians(start))
+    frame = best(lambda: roll.window(start, 1), 4)
+    clip = best(lambda: _train(roll, start), 4)
+    shown = best(lambda: untrained.gaussians(start), 4)
     per_particle = 1e6 / count
     return [
         Record("particles in the benchmark's frames", count, "", source=f"{len(history):,} over {history.frames} frames"),
@@ -200,13 +199,3 @@ def _train(roll: Rollout, start: int) -> None:
     clip = roll.window(start, CLIP, begin="simulation")
     loss = RegularizationWeights().total(regularization(clip, roll.learned_look))
     torch.stack([loss, *(getattr(r.gaussians, name).sum() for r in clip for name in FIELDS)]).sum().backward()
-
-
-def _best(call: Callable[[], object], times: int = 4) -> float:
-    """Seconds of the fastest of several calls, the one that others on the machine disturbed least."""
-    seconds = []
-    for _ in range(times + 1):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])

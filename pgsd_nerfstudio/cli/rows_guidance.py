@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.guidance import DistillationConfig, PriorError, TimestepSchedule, VideoPrior, distill, distill_clip
 
 SHAPE = (1, 3, 4, 6, 8)
@@ -67,9 +66,9 @@ def bench(quick: bool) -> list[Record]:
     noisy = prior.encode(clip).detach()
     both = torch.cat([negative, text])
     seconds = (
-        _best(lambda: _encode_and_back(prior, clip)),
-        _best(lambda: prior.predict_v(noisy, 500, both)),
-        _best(lambda: _distill_clip(prior, clip, text, negative)),
+        best(lambda: _encode_and_back(prior, clip), 2),
+        best(lambda: prior.predict_v(noisy, 500, both), 2),
+        best(lambda: _distill_clip(prior, clip, text, negative), 2),
     )
     exact_prior = VideoPrior.load("bundled", prior.device, torch.float64)
     exact = _distill_clip(exact_prior, clip, text, negative)
@@ -172,13 +171,3 @@ def _encode_and_back(prior: VideoPrior, clip: Tensor) -> Tensor:
 def _distill_clip(prior: VideoPrior, clip: Tensor, text: Tensor, negative: Tensor) -> Tensor:
     rng = torch.Generator().manual_seed(0)
     return distill_clip(prior, clip, text, negative, 500, config=DistillationConfig(), generator=rng).gradient
-
-
-def _best(call: Callable[[], object], times: int = 2) -> float:
-    """Seconds of the fastest of several calls, the one that others on the machine disturbed least."""
-    seconds = []
-    for _ in range(times + 1):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])

@@ -11,6 +11,7 @@ import torch
 
 from pgsd_nerfstudio.cli import rows_air_cases
 from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, WindField, simulate
 from pgsd_nerfstudio.physics.airborne import GRAVITY, Flutter, advance
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
@@ -55,7 +56,7 @@ def bench(quick: bool) -> list[Record]:
     """Cost beside error."""
     count = 20_000
     error = _integration_error()
-    kernel = 1e9 * _best(_kernel_step(count), 10 if quick else 50) / count
+    kernel = 1e9 * best(_kernel_step(count), 10 if quick else 50) / count
     frames = 50 if quick else 250
     simulate(_yard(), SNOWFALL, Clock(frames=3), DOMAIN, progress=False)
     began = time.perf_counter()
@@ -170,16 +171,6 @@ def _kernel_step(count: int):
     position, velocity, speed = _particles(count, np.float32)
     flutter = Flutter(np.full(count, 0.1, np.float32), np.full(count, 1.5, np.float32), speed)
     return lambda: advance(position, velocity, speed, flutter, _WIND, 0.3, 0.04)
-
-
-def _best(call, times: int) -> float:
-    """Seconds of the fastest of several calls, which is the one that others on the machine disturbed least."""
-    seconds = []
-    for _ in range(times + 1):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])
 
 
 def _integration_error() -> float:

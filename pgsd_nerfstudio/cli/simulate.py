@@ -72,8 +72,12 @@ class Simulate:
         )
         paths = self.output / "report.json", self.output / "report.png"
         with refusing(OSError):
-            paths[0].write_text(json.dumps(found, indent=1) + "\n")
-            draw(found).savefig(paths[1], dpi=110)
+            # Beside first and then renamed, so that no file is ever half a report.
+            beside = [path.with_name(f".{path.name}") for path in paths]
+            beside[0].write_text(json.dumps(found, indent=1) + "\n")
+            draw(found).savefig(beside[1], dpi=110, format="png")
+            for written, path in zip(beside, paths, strict=True):
+                written.replace(path)
         print(*paths, sep="\n")
         return 0
 

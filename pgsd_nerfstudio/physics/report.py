@@ -48,12 +48,6 @@ def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
         "bytes": sum(t.nbytes for t in vars(history).values() if isinstance(t, torch.Tensor)),
         "mass_emitted": float(masses.sum()),
         "mass_gone": gone,
-        "mass_lost": float(masses.sum()) - gone - rows["mass_in_air"][-1] - _landed(history, masses),
+        "mass_lost": float(masses.sum()) - gone - rows["mass_in_air"][-1] - rows["mass_resting"][-1],
         "per_frame": rows,
     }
-
-
-def _landed(history: ParticleHistory, masses: torch.Tensor) -> float:
-    """Mass of what has landed by the end, particles whose contact is the last frame included unless they count as flying."""
-    last = history.frames - 1
-    return float(masses[(history.collided & (history.ends <= last)).cpu()].sum())

@@ -79,10 +79,3 @@ def axis_terms(base, by, bz):
         terms[1, o] = (j >> 2) * bz * CELLS + (j & 3) * 4
         terms[2, o] = (k >> 2) * CELLS + (k & 3)
     return terms
-
-
-@ti.func
-def node_of(row, by, bz):
-    """The node (i, j, k) of a row."""
-    b, q = row // CELLS, row % CELLS
-    return ti.Vector([(b // (by * bz)) * 4 + q // 16, ((b // bz) % by) * 4 + (q // 4) % 4, (b % bz) * 4 + q % 4])
