@@ -29,9 +29,11 @@ def falling(count: int = 60, frames: int = 40, seed: int = 0) -> ParticleHistory
         rest_positions=torch.where(collided[:, None], rest, 0.0),
         rest_quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=1),
         rest_extents=torch.ones(count),
+        rest_covers=torch.zeros(count),
         quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=1),
         diameters=torch.full((count,), 0.005),
         represents=torch.ones(count),
+        kinds=torch.zeros(count, dtype=torch.uint8),
         fps=25.0,
         frames=frames,
     )

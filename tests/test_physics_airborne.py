@@ -6,9 +6,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from pgsd_nerfstudio.physics.airborne import _SINE, GRAVITY, Flutter, advance
+from pgsd_nerfstudio.physics.clock import Domain
+from pgsd_nerfstudio.physics.deflection import Deflection
 from pgsd_nerfstudio.physics.wind import WindField
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.effect import Wind
 
 WIND = WindField.draw(Wind(), 3)
@@ -61,6 +65,36 @@ def test_the_kernel_feels_the_wind_of_the_plain_form(dtype, tolerance):
     velocity, at = np.zeros_like(position), position.astype(np.float64)
     advance(position, velocity, np.full(200, 1e-9, dtype), Flutter.none(200, dtype), WIND, 1.5, 0.04)
     np.testing.assert_allclose(velocity, WIND.velocity(at, 1.52), atol=tolerance)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 3e-7), (np.float32, 3e-5)])
+def test_the_kernel_feels_obstacles_as_the_plain_form_does(dtype, tolerance):
+    """Two walls at right angles; particles beside them, in the ground, and where the difference fades out and beyond."""
+    corners = [[0.4, -2, -0.5], [0.4, 2, -0.5], [0.4, 0, 2.2], [-2, 1.3, -0.5], [2, 1.3, -0.5], [0, 1.3, 1.8]]
+    walls = SurfaceMesh(torch.tensor(corners), torch.tensor([[0, 1, 2], [3, 4, 5]], dtype=torch.int32))
+    deflection = Deflection.of(walls, Domain((-2.5, -2.5, -0.3), (2.5, 2.5, 3.0)), Wind())
+    wind = WindField.draw(Wind(), 3, deflection)
+    position = np.random.default_rng(6).uniform([-4, -4, -0.6], [4, 4, 5], (2000, 3)).astype(dtype)
+    velocity, at = np.zeros_like(position), position.astype(np.float64)
+    advance(position, velocity, np.full(2000, 1e-9, dtype), Flutter.none(2000, dtype), wind, 1.5, 0.04)
+    plain = wind.velocity(at, 1.52)
+    np.testing.assert_allclose(velocity, plain, atol=tolerance)
+    changed = np.linalg.norm(plain - WIND.velocity(at, 1.52), axis=1)
+    assert (changed > 0.05).sum() > 200 and (changed < 1e-12).sum() > 200
+
+
+def test_a_particle_that_is_nowhere_harms_nothing():
+    corners = torch.tensor([[0.4, -2, -0.5], [0.4, 2, -0.5], [0.4, 0, 2.2]])
+    deflection = Deflection.of(
+        SurfaceMesh(corners, torch.tensor([[0, 1, 2]], dtype=torch.int32)), Domain((-2, -2, 0), (2, 2, 3)), Wind()
+    )
+    position, velocity, speed = particles(6, np.float64)
+    position[:4] = [[np.nan] * 3, [np.inf] * 3, [-np.inf] * 3, [1e30, -1e30, 1e30]]
+    wind = WindField.draw(Wind(turbulence=0.0), 3, deflection)
+    assert np.isfinite(wind.velocity(position[3:], 0.0)).all()
+    assert np.isnan(wind.velocity(position[:1], 0.0)).all()
+    advance(position, velocity, speed, Flutter.none(6, np.float64), wind, 0.0, 0.04)
+    assert np.isnan(position[0]).all() and np.isfinite(position[3:]).all()
 
 
 def test_flutter_is_a_sideways_circle_of_the_given_speed():

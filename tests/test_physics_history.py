@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from pgsd_nerfstudio.physics.chunks import Chunk, State, assemble
+from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 
 @pytest.fixture
@@ -26,9 +30,11 @@ def history() -> ParticleHistory:
         rest_positions=torch.tensor([[3.0, 0, -3], [0, 0, 0], [0, 0, 0]]),
         rest_quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
         rest_extents=torch.tensor([0.1, 0, 0]),
+        rest_covers=torch.tensor([0.02, 0, 0]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
         diameters=torch.full((3,), 0.005),
         represents=torch.ones(3),
+        kinds=torch.tensor([0, 2, 5], dtype=torch.uint8),
         fps=25.0,
         frames=6,
         about={"effect": "test", "seed": 3},
@@ -87,6 +93,76 @@ def test_a_damaged_file_is_no_history(history, tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     assert ParticleHistory.load(path) is None
     assert ParticleHistory.load(tmp_path / "none.safetensors") is None
+
+
+def test_saved_positions_are_rounded_by_half_a_quantum_at_most(history, tmp_path):
+    off = replace(history, positions=history.positions + 1e-3 * torch.arange(7)[:, None])
+    off.save(tmp_path / "h.safetensors")
+    again = ParticleHistory.load(tmp_path / "h.safetensors")
+    assert again is not None
+    assert 0 < float((again.positions - off.positions).abs().max()) <= 2**-15
+
+
+def test_a_file_whose_steps_do_not_fit_is_no_history(history, tmp_path):
+    path = tmp_path / "h.safetensors"
+    history.save(path)
+    stored = load_tensors(path)
+    assert stored is not None
+    save_tensors(path, {**stored[0], "steps_two": stored[0]["steps_two"][:-1]}, stored[1])
+    assert ParticleHistory.load(path) is None
+    save_tensors(path, stored[0], {**stored[1], "format": 1})
+    assert ParticleHistory.load(path) is None
+    save_tensors(path, *stored)
+    assert ParticleHistory.load(path) is not None
+
+
+def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_path):
+    rng = np.random.default_rng(4)
+    count, frames = 5, 7
+    none, one = np.zeros(0, np.float32), np.ones(count, np.float32)
+    chunk = Chunk(
+        start=0,
+        frames=frames,
+        row_ids=np.tile(np.arange(count, dtype=np.int32), frames),
+        row_frames=np.arange(frames, dtype=np.int32).repeat(count),
+        row_positions=rng.normal(size=(count * frames, 3)).astype(np.float32),
+        births=np.zeros(count, np.int32),
+        diameters=one,
+        represents=one,
+        quats=np.ones((count, 4), np.float32),
+        kind_ids=np.array([1, 3], np.int32),
+        kind_bits=np.array([2, 5], np.uint8),
+        ended_ids=none.astype(np.int32),
+        ended_frames=none.astype(np.int32),
+        ended_how=none.astype(np.uint8),
+        rest_ids=none.astype(np.int32),
+        rest_positions=none.reshape(0, 3),
+        rest_quats=none.reshape(0, 4),
+        rest_extents=none,
+        rest_covers=none,
+        state=replace(State.empty(), born=count),
+    )
+    fresh = assemble([chunk], Clock(fps=25.0, frames=frames), {})
+    fresh.save(tmp_path / "h.safetensors")
+    again = ParticleHistory.load(tmp_path / "h.safetensors")
+    assert again is not None
+    assert again.kinds.tolist() == [0, 2, 0, 5, 0]
+    for name, value in vars(fresh).items():
+        if isinstance(value, torch.Tensor):
+            assert value.numpy().tobytes() == getattr(again, name).numpy().tobytes(), name
+
+
+def test_its_size_is_that_of_its_tensors(history):
+    # Per particle 2 int32, 1 bool, 1 uint8, 3 + 4 + 4 + 4 float32 (place, two orientations, four lengths and counts).
+    assert history.nbytes == 7 * 12 + 4 * 8 + 3 * (8 + 1 + 1 + 15 * 4)
+
+
+def test_nan_is_not_saved(history, tmp_path):
+    positions = history.positions.clone()
+    positions[4, 1] = torch.nan
+    with pytest.raises(ValueError, match="positions of particle 1 are not finite 1 frames after its birth"):
+        replace(history, positions=positions).save(tmp_path / "h.safetensors")
+    assert not list(tmp_path.iterdir())
 
 
 def test_nan_is_reported_with_its_frame(history):

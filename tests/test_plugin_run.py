@@ -36,7 +36,7 @@ def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("only training may do this")
 
-    simulation = importlib.import_module("pgsd_nerfstudio.physics.simulate")
+    simulation = importlib.import_module("pgsd_nerfstudio.physics.prior")
     monkeypatch.setattr(simulation, "simulate", forbidden)
     monkeypatch.setattr(simulation, "motion_prior", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.guidance.prior.VideoPrior.load", forbidden)

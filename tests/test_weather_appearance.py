@@ -61,14 +61,16 @@ def test_patches_have_the_volume_of_the_snow_they_stand_for():
     scales = initial_look(replace(SNOWFALL, appearance=plain), free).collided.scales
     volume = (2 * np.pi) ** 1.5 * scales.prod(1)
     water = torch.from_numpy(mass(free.diameters.double().numpy())) * free.represents
-    torch.testing.assert_close(volume.double(), water * plain.accumulation_speedup / plain.layer_density, rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        volume.double(), water * SNOWFALL.surface.accumulation_speedup / SNOWFALL.surface.layer_density, rtol=1e-3, atol=0
+    )
 
 
 def test_a_time_lapse_makes_patches_wider_not_thicker():
-    faster = replace(SNOWFALL.appearance, accumulation_speedup=4 * SNOWFALL.appearance.accumulation_speedup)
+    faster = replace(SNOWFALL.surface, accumulation_speedup=4 * SNOWFALL.surface.accumulation_speedup)
     free = Landed()
     free.rest_extents = torch.full((2000,), 10.0)
-    slow, fast = (initial_look(replace(SNOWFALL, appearance=a), free).collided.scales for a in (SNOWFALL.appearance, faster))
+    slow, fast = (initial_look(replace(SNOWFALL, surface=layer), free).collided.scales for layer in (SNOWFALL.surface, faster))
     torch.testing.assert_close(fast / slow, torch.tensor([2.0, 2.0, 1.0]).expand(2000, 3), rtol=1e-4, atol=0)
 
 

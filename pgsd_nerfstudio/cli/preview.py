@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
 
@@ -44,7 +44,12 @@ class Preview:
     start: float | None = None
     """First second to show; by default the last ones are shown, when the most has gathered."""
     intensity: float | None = None
-    """Precipitation in mm/h of water (light snow below 1, heavy above 2.5); by default the effect's own."""
+    """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres; by
+    default the effect's own."""
+    physics: Literal["metric", "paper"] = "metric"
+    """metric is right in SI units; paper is the publication's solver and numbers, to compare with."""
+    everything: bool = False
+    """Simulate also the air that no training camera can see."""
     exposure: float | None = None
     """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default the effect's own."""
     max_particles: int | None = None
@@ -138,7 +143,8 @@ class Preview:
         clock = Clock(self.fps, max(round(self.seconds * self.fps), self._first + self.frames))
         # As many as ns-train takes by default, so that training finds this motion prior in the cache.
         most = self.max_particles or (200_000 if device == "cuda" else MAX_PARTICLES)
-        history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=most).to(device)
+        how = {"profile": self.physics, "everything": self.everything}
+        history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=most, **how).to(device)
         # A field that has learned nothing hands on the simulated motion and the initial look, bit for bit.
         look, field = initial_look(effect, history, seed=self.seed), DynamicsField.for_history(history)
         rollout = Rollout(history, look, field, exposure=effect.appearance.exposure)

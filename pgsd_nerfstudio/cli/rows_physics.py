@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from pgsd_nerfstudio.cli import rows_air_cases
+from pgsd_nerfstudio.cli import rows_air_cases, rows_regimes
 from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, WindField, simulate
@@ -24,7 +24,7 @@ DOMAIN = Domain((-3.0, -3.0, -0.2), (3.0, 3.0, 4.0))
 def verify(quick: bool) -> list[Record]:
     """Laws with known answers."""
     run = simulate(_yard(), SNOWFALL, Clock(frames=100), DOMAIN, max_particles=2000, progress=False)
-    ended = sum(run.about[kind] for kind in ("landed", "slid", "left", "in_air"))
+    ended = sum(run.about[kind] for kind in ("landed", "absorbed", "left", "unseen", "in_air"))
     return [
         Record.judged("free fall against analytic, float64", _fall_error(np.float64), "m", "<= 1e-9", source=_DRAG),
         Record.judged("free fall against analytic, float32", _fall_error(np.float32), "m", "<= 1e-5", source=_DRAG),
@@ -42,12 +42,13 @@ def verify(quick: bool) -> list[Record]:
             abs(run.about["emitted"] - ended),
             "",
             "<= 0",
-            source="emitted = landed + slid + left + in the air",
+            source="emitted = landed + absorbed + left + unseen + in the air",
         ),
         Record.judged(
             "landed particles off the surface", _off_surface(run), "m", "<= 1e-4", source="height of the yard's planes"
         ),
         *rows_air_cases.cases(quick),
+        *rows_regimes.cases(quick),
         *_dense(quick, "cases"),
     ]
 
@@ -71,6 +72,7 @@ def bench(quick: bool) -> list[Record]:
         ),
         Record(f"motion prior of {frames} frames, {len(run):,} particles", seconds, "s", source="flat yard with a table"),
         *rows_air_cases.costs(quick),
+        *rows_regimes.costs(quick),
         *_dense(quick, "costs"),
     ]
 
@@ -79,9 +81,9 @@ def _dense(quick: bool, kind: Literal["cases", "costs"]) -> list[Record]:
     """Rows of the material point method; not in --quick, where compiling its kernels alone would take the time of all."""
     if quick:
         return []
-    from pgsd_nerfstudio.cli import rows_mpm_cases  # starts Taichi
+    from pgsd_nerfstudio.cli import rows_mpm_cases, rows_mpm_costs, rows_paper  # start Taichi
 
-    return rows_mpm_cases.cases(False) if kind == "cases" else rows_mpm_cases.costs(False)
+    return rows_mpm_cases.cases(False) if kind == "cases" else [*rows_mpm_costs.costs(False), *rows_paper.costs(False)]
 
 
 _DRAG = "v = v_t + (v_0 - v_t) exp(-t g / v_t)"
@@ -163,7 +165,7 @@ def _water_error(quick: bool) -> float:
 
 
 def _off_surface(run: ParticleHistory) -> float:
-    height = run.rest_positions[run.collided][:, 2] - SNOWFALL.surface.settle
+    height = run.rest_positions[run.collided][:, 2] - run.rest_covers[run.collided] - SNOWFALL.surface.settle
     return float(torch.minimum(height.abs(), (height - 0.75).abs()).max())
 
 

@@ -8,7 +8,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pgsd_nerfstudio.cli.preview import open_scene, say
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
@@ -28,7 +28,12 @@ class Simulate:
     effect: str = "snowfall"
     """Which weather."""
     intensity: float | None = None
-    """Precipitation in mm/h of water (light snow below 1, heavy above 2.5); by default the effect's own."""
+    """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres; by
+    default the effect's own."""
+    physics: Literal["metric", "paper"] = "metric"
+    """metric is right in SI units; paper is the publication's solver and numbers, to compare with."""
+    everything: bool = False
+    """Simulate also the air that no training camera can see."""
     seconds: float = 10.0
     """Length of the weather."""
     fps: float = 25.0
@@ -62,7 +67,16 @@ class Simulate:
             say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
             surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"))
             clock = Clock(self.fps, max(2, round(self.seconds * self.fps)))
-            history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=self.max_particles)
+            history = motion_prior(
+                scene,
+                surface,
+                effect,
+                clock,
+                seed=self.seed,
+                max_particles=self.max_particles,
+                profile=self.physics,
+                everything=self.everything,
+            )
         found = report(history, effect.material)
         found["scale"] = {"metres_per_unit": scene.frame.metres_per_unit, "source": scene.frame.source}
         found["wall_seconds"] = time.perf_counter() - began

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,18 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.clock import Clock
+from pgsd_nerfstudio.physics.codec import quantised
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
 
-LANDED, SLID, LEFT = 0, 1, 2  # how a particle ended; what ended none of these ways is still in the air
+LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; what ended none of these ways still moves
+ENDS = {"landed": LANDED, "absorbed": ABSORBED, "left": LEFT, "unseen": UNSEEN}
+SPLASHED, SLID, DENSE = 1, 2, 4  # bits of what a particle ever was: droplet of a splash, sliding, dense matter
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """n particles in the air; what one of them needs to fly on."""
+    """n particles on their way; what one of them needs to go on."""
 
     ids: Int[ndarray, "n"]
     positions: Float[ndarray, "n 3"]
@@ -37,6 +40,10 @@ class Bodies:
     """Draw from 0..1 that decides whether it stays on a slope."""
     spins: Float[ndarray, "n"]
     """Turns about the normal when it lies."""
+    represents: Float[ndarray, "n"]
+    """Real particles that it stands for."""
+    kinds: Int[ndarray, "n"]
+    """Bits SPLASHED, SLID and DENSE."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -48,17 +55,26 @@ class Bodies:
     def join(parts: Sequence[Bodies]) -> Bodies:
         return Bodies(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Bodies)))
 
+    def marked(self, kind: int) -> Bodies:
+        """The same particles, which now have been of that kind too."""
+        return replace(self, kinds=self.kinds | np.uint8(kind))
+
     @staticmethod
     def none() -> Bodies:
         widths = {"positions": (0, 3), "velocities": (0, 3)}
-        return Bodies(*(np.zeros(widths.get(f.name, 0), np.int32 if f.name == "ids" else np.float32) for f in fields(Bodies)))
+        types = {"ids": np.int32, "kinds": np.uint8}
+        return Bodies(*(np.zeros(widths.get(f.name, 0), types.get(f.name, np.float32)) for f in fields(Bodies)))
 
 
 @dataclass(frozen=True)
 class State:
     """Everything the next frame depends on."""
 
-    bodies: Bodies
+    flying: Bodies
+    sliding: Bodies
+    dense: Bodies
+    deposits: Mapping[str, ndarray]
+    """What lies on surfaces, and the dense matter's own state: see `deposits.Deposits`."""
     born: int
     """Particles so far; the next id."""
     carry: float
@@ -66,7 +82,27 @@ class State:
 
     @staticmethod
     def empty() -> State:
-        return State(Bodies.none(), 0, 0.0)
+        return State(Bodies.none(), Bodies.none(), Bodies.none(), {}, 0, 0.0)
+
+    @property
+    def moving(self) -> int:
+        """Particles on their way."""
+        return len(self.flying) + len(self.sliding) + len(self.dense)
+
+    def arrays(self) -> dict[str, ndarray]:
+        """All arrays by name."""
+        groups = {"flying": self.flying, "sliding": self.sliding, "dense": self.dense}
+        named = {f"{group}.{f.name}": getattr(bodies, f.name) for group, bodies in groups.items() for f in fields(Bodies)}
+        return named | {f"deposits.{name}": value for name, value in self.deposits.items()}
+
+    @staticmethod
+    def of(arrays: Mapping[str, ndarray], born: int, carry: float) -> State:
+        """From what `arrays` gave."""
+        flying, sliding, dense = (
+            Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in ("flying", "sliding", "dense")
+        )
+        deposits = {name.removeprefix("deposits."): value for name, value in arrays.items() if name.startswith("deposits.")}
+        return State(flying, sliding, dense, deposits, born, carry)
 
 
 @dataclass(frozen=True)
@@ -84,6 +120,9 @@ class Chunk:
     diameters: Float[ndarray, "b"]
     represents: Float[ndarray, "b"]
     quats: Float[ndarray, "b 4"]
+    kind_ids: Int[ndarray, "k"]
+    """Particles that became of a kind in this chunk, and the bits of all kinds that they then have been of."""
+    kind_bits: Int[ndarray, "k"]
     ended_ids: Int[ndarray, "e"]
     ended_frames: Int[ndarray, "e"]
     """Exclusive end of the active frames."""
@@ -93,6 +132,7 @@ class Chunk:
     rest_positions: Float[ndarray, "h 3"]
     rest_quats: Float[ndarray, "h 4"]
     rest_extents: Float[ndarray, "h"]
+    rest_covers: Float[ndarray, "h"]
     state: State
     """At the end of the chunk."""
 
@@ -107,8 +147,8 @@ def _path(folder: Path, index: int) -> Path:
 def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
     """Store a chunk; False where the disk would not take it."""
     tensors = {name: torch.from_numpy(np.ascontiguousarray(getattr(chunk, name))) for name in _ARRAYS}
-    bodies = chunk.state.bodies
-    tensors |= {f"state.{f.name}": torch.from_numpy(np.ascontiguousarray(getattr(bodies, f.name))) for f in fields(Bodies)}
+    arrays = chunk.state.arrays()
+    tensors |= {f"state.{name}": torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
     plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born, "carry": chunk.state.carry.hex()}
     try:
         save_tensors(_path(folder, index), tensors, {**plain, "content": content_key(tensors, plain)})
@@ -127,12 +167,13 @@ def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | Non
     if content != content_key(tensors, about) or (about.get("start"), about.get("frames")) != (start, frames):
         return None
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    bodies = Bodies(*(arrays.pop(f"state.{f.name}") for f in fields(Bodies)))
-    state = State(bodies, about["born"], float.fromhex(about["carry"]))
+    inner = {name: arrays.pop(name) for name in list(arrays) if name.startswith("state.")}
+    inner = {name.removeprefix("state."): value for name, value in inner.items()}
+    state = State.of(inner, about["born"], float.fromhex(about["carry"]))
     return Chunk(start=start, frames=frames, state=state, **arrays)
 
 
-_LYING = {"positions": (3,), "quats": (4,), "extents": ()}
+_LYING = {"positions": (3,), "quats": (4,), "extents": (), "covers": ()}
 
 
 def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) -> ParticleHistory:
@@ -155,18 +196,23 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     lying["rest_quats"][:, 0] = 1.0
     for name, value in lying.items():
         value[rests] = joined(name)
+    kinds = np.zeros(count, np.uint8)
+    np.bitwise_or.at(kinds, joined("kind_ids"), joined("kind_bits"))
     arrays = {
         "births": births,
         "ends": ends,
         "collided": collided,
         "offsets": offsets,
-        "positions": positions,
+        "positions": quantised(positions, offsets),
         **lying,
         "quats": joined("quats"),
         "diameters": joined("diameters"),
         "represents": joined("represents"),
+        "kinds": kinds,
     }
-    counts = {name: int((how == code).sum()) for name, code in (("landed", LANDED), ("slid", SLID), ("left", LEFT))}
-    counts |= {"emitted": count, "in_air": len(chunks[-1].state.bodies)}
+    last = chunks[-1].state
+    counts = {name: int((how == code).sum()) for name, code in ENDS.items()}
+    counts |= {"emitted": count, "in_air": last.moving, "splashed": int((kinds & SPLASHED > 0).sum())}
+    counts |= {"slid": int((kinds & SLID > 0).sum()), "dense": int((kinds & DENSE > 0).sum())}
     tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
     return ParticleHistory(**tensors, fps=clock.fps, frames=clock.frames, about={**about, **counts})

@@ -1,15 +1,16 @@
 """Landing: where a path meets the surface, whether the particle stays, and how it lies.
 
 Paths are tested as one ray per particle and frame, against the mesh itself (no grid to fall through); particles with free air
-around them are spared the ray. What hits is projected onto the closest point of the mesh. Whether it stays depends on the slope
-only: always up to `holds_degrees`, never from `slips_degrees`, and with linearly falling chance in between. What does not stay
-is removed where it touched: it slides or bounces off unseen, the cover being what one looks at.
+around them are spared the ray. Where a cover lies, contact is made on top of it. What hits is projected onto the closest
+point of
+the mesh. Whether it stays depends on the slope only: always up to `holds_degrees`, never from `slips_degrees`, and with
+linearly falling chance in between; what does not stay slides.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -22,12 +23,25 @@ from pgsd_nerfstudio.weather.effect import SurfaceResponse
 if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import Hits, SurfaceMesh
 
-CELL = 0.12  # m, of the map of where the surface is
+CELL = 0.12  # m, of the map of where the surface is, at least
+MAX_CELLS = 20_000_000  # of that map; larger scenes have larger cells
 BAND = 3  # cells around it that count as near: a path shorter than (BAND - 1) cells cannot reach the surface from outside
 PROBE_RINGS = (0.25, 0.5, 1.0)  # of SurfaceResponse.probe
 PROBES = 8  # per ring
 SMALLEST = 0.15  # of SurfaceResponse.probe: extent where even the first ring finds no surface, as on a blade of grass
 ROUGH = 0.35  # rise per run within which the neighbourhood still counts as the same surface
+
+
+GRAZING = 0.2  # sine of the flattest path for which a cover's thickness is counted along the path
+
+
+class Raised(Protocol):
+    """A cover that lies on the surface (physics.cover has it)."""
+
+    def height(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]: ...
+    def normal(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]: ...
+    @property
+    def thickest(self) -> float: ...
 
 
 class Meeting(NamedTuple):
@@ -37,6 +51,7 @@ class Meeting(NamedTuple):
     """Index of the path."""
     points: Float[ndarray, "h 3"]
     normals: Float[ndarray, "h 3"]
+    """Of the side from which the path came."""
 
 
 class Rest(NamedTuple):
@@ -55,42 +70,49 @@ class Ground:
     response: SurfaceResponse
     lower: Float[ndarray, "3"]
     near: Bool[ndarray, "x y z"]
-    """Cells of edge CELL with surface in them or within BAND cells."""
+    """Cells with surface in them or within BAND cells."""
+    cell: float
+    """Their edge, metres."""
 
     @staticmethod
     def of(surface: SurfaceMesh, response: SurfaceResponse, domain: Domain) -> Ground:
         """Map where the surface is within the domain."""
         lower = np.asarray(domain.lower, np.float64)
-        shape = tuple(np.ceil(np.asarray(domain.size) / CELL).astype(int) + 1)
+        cell = max(CELL, (domain.volume / MAX_CELLS) ** (1 / 3))
+        shape = tuple(np.ceil(np.asarray(domain.size) / cell).astype(int) + 1)
         near = torch.zeros(shape)
         corners = (
             surface.vertices.numpy(force=True)[surface.triangles.numpy(force=True)]
             if len(surface.triangles)
             else np.zeros((0, 3, 3))
         )
-        cells = np.floor((cover(corners, CELL / 2) - lower) / CELL).astype(int)
+        cells = np.floor((cover(corners, cell / 2) - lower) / cell).astype(int)
         cells = cells[((cells >= -BAND) & (cells < np.asarray(shape) + BAND)).all(1)].clip(0, np.asarray(shape) - 1)
         near[tuple(cells.T)] = 1.0
         for axis in range(3):  # a cube grows axis by axis
             pooled = near.movedim(axis, 2).reshape(1, -1, shape[axis])
             pooled = torch.nn.functional.max_pool1d(pooled, 2 * BAND + 1, 1, BAND)
             near = pooled.reshape(near.movedim(axis, 2).shape).movedim(2, axis)
-        return Ground(surface, response, lower, near.numpy() > 0)
+        return Ground(surface, response, lower, near.numpy() > 0, cell)
 
-    def meet(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"]) -> Meeting:
-        """First contact of each straight path with the surface, of those that have one."""
+    def meet(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], cover: Raised | None = None) -> Meeting:
+        """First contact of each straight path with the surface, or with the cover on it, of those that have one."""
         path = stop - start
         length = np.sqrt((path * path).sum(1))
-        cells = ((start - self.lower.astype(start.dtype)) * start.dtype.type(1 / CELL)).astype(np.int32)
+        thickest = cover.thickest if cover is not None else 0.0
+        cells = ((start - self.lower.astype(start.dtype)) * start.dtype.type(1 / self.cell)).astype(np.int32)
         inside = ((cells >= 0) & (cells < self.near.shape)).all(1)
         x, y, z = np.where(inside[:, None], cells, 0).T
-        test = (self.near[x, y, z] | ~inside | (length > (BAND - 1) * CELL)) & (length > 0)
+        test = (self.near[x, y, z] | ~inside | (length + thickest > (BAND - 1) * self.cell)) & (length > 0)
         tried = test.nonzero()[0]
         if len(tried) == 0 or len(self.surface.triangles) == 0:
             return Meeting(tried[:0], start[:0], start[:0])
         direction = path[tried] / length[tried, None]
         hits = self._cast(start[tried], direction)
         distance, normal = hits.distance.numpy(), hits.normal.numpy()
+        normal = np.where((normal * direction).sum(1, keepdims=True) > 0, -normal, normal)
+        if cover is not None and thickest > 0:
+            distance, normal = _on_cover(cover, thickest, start[tried], direction, length[tried], distance, normal)
         met = distance <= length[tried]
         which = tried[met]
         return Meeting(which, start[which] + direction[met] * distance[met, None], normal[met])
@@ -113,15 +135,22 @@ class Ground:
         low, high = self.response.holds_degrees, self.response.slips_degrees
         return draw < (high - slope) / max(high - low, 1e-6)
 
-    def rest(self, points: Float[ndarray, "h 3"], spin: Float[ndarray, "h"]) -> Rest:
-        """Lay particles down at their contacts, thin axis along the normal, turned by `spin` turns about it."""
+    def rest(self, points: Float[ndarray, "h 3"], spin: Float[ndarray, "h"], covers: Float[ndarray, "h"] | None = None) -> Rest:
+        """Lay particles down at their contacts, thin axis along the normal, turned by `spin` turns about it.
+
+        covers: thickness in metres of what lies on the surface there, which raises them.
+        """
+        raised = np.zeros((len(points), 3))
+        if covers is not None:
+            raised[:, 2] = covers
+        points = points - raised
         if len(points) == 0:
             return Rest(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
         closest = self.surface.closest(torch.from_numpy(points.astype(np.float32)))
         at, normal = closest.points.numpy(), _upward(closest.normals.numpy())
         normal, extent = self._feel(at, normal)
         quats = _turned(normal, spin)
-        return Rest((at + self.response.settle * normal).astype(np.float32), quats, extent)
+        return Rest((at + self.response.settle * normal + raised).astype(np.float32), quats, extent)
 
     def _feel(
         self, at: Float[ndarray, "h 3"], normal: Float[ndarray, "h 3"]
@@ -149,6 +178,34 @@ class Ground:
             extent[alive] = radius
         smooth = _upward(total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-6))
         return smooth, extent
+
+
+def _on_cover(
+    cover: Raised,
+    thickest: float,
+    start: Float[ndarray, "n 3"],
+    direction: Float[ndarray, "n 3"],
+    length: Float[ndarray, "n"],
+    distance: Float[ndarray, "n"],
+    normal: Float[ndarray, "n 3"],
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n 3"]]:
+    """Distances and normals of hits on surfaces that look up, moved up onto the cover.
+
+    A plane that is raised by h is met h n_z / (-d . n) earlier; never before the start, where the cover grew over a particle.
+    """
+    into = -(direction * normal).sum(1)
+    near = np.isfinite(distance) & (normal[:, 2] > 0) & (distance <= length + thickest / GRAZING)
+    which = near.nonzero()[0]
+    if len(which) == 0:
+        return distance, normal
+    base = start[which] + direction[which] * distance[which, None]
+    height = cover.height(base.astype(np.float64))
+    distance, normal = distance.copy(), normal.copy()
+    distance[which] -= height * normal[which, 2] / np.maximum(into[which], GRAZING)
+    distance[which] = distance[which].clip(0.0)
+    thick = height > 1e-3  # a thinner one has the slope of what it lies on
+    normal[which[thick]] = cover.normal(base[thick].astype(np.float64))
+    return distance, normal
 
 
 def _upward(normal: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:

@@ -1,10 +1,10 @@
 """What comes into the box of air: which sizes, how many, where.
 
-Steady snowfall is the same everywhere in the air: number density N(D) in the volume, flux N(D) v(D) through the top. So the
+Steady weather is the same everywhere in the air: number density N(D) in the volume, flux N(D) v(D) through the top. So the
 box starts full, is fed at the top, and what the wind blows out at one side comes in at the opposite side as a new particle: no
 wedge stays empty, and nothing is simulated outside of the box.
 
-There are far more real flakes than can be simulated or seen. A real flake is simulated with a chance that grows with its
+There are far more real particles than can be simulated or seen. A real particle is simulated with a chance that grows with its
 diameter, and then represents 1 / chance of its kind: counts are thinned, water is not.
 """
 
@@ -17,10 +17,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.clock import Domain
+from pgsd_nerfstudio.physics.populations import cumulative, fall_speed, integral, number_density
 from pgsd_nerfstudio.weather.effect import Effect
-from pgsd_nerfstudio.weather.snowfall import fall_speed, mass, melted_diameter, number_density
-
-MM_PER_HOUR = 1.0 / 3600.0  # of water, in kg/(m^2 s)
 
 
 @dataclass(frozen=True)
@@ -42,19 +40,15 @@ class Sizes:
     def of(effect: Effect, volume: float, max_particles: int) -> Sizes:
         """The spectrum of an effect, thinned so that about `max_particles` are in `volume` m^3 of air at once.
 
-        All of the requested water is carried by the simulated range of sizes.
+        All of what is asked for is carried by the simulated range of sizes.
         """
         emission, material = effect.emission, effect.material
         diameter = np.geomspace(emission.smallest, emission.largest, 1024)
-        masses, speeds = mass(diameter, material), fall_speed(diameter, material)
-        melted = melted_diameter(masses)
-        # From per metre of melted diameter to per metre of diameter.
-        density = number_density(melted, emission.intensity) * np.gradient(melted, diameter)
-        density *= emission.intensity * MM_PER_HOUR / _integral(density * speeds * masses, diameter)
+        density, speeds = number_density(diameter, emission, material), fall_speed(diameter, material)
         weight = (diameter / emission.largest) ** emission.importance
 
         def simulated(factor: float) -> float:
-            return _integral(density * np.minimum(1.0, factor * weight), diameter) * volume
+            return integral(density * np.minimum(1.0, factor * weight), diameter) * volume
 
         low, high = 0.0, float(1.0 / weight.min())
         if simulated(high) > max_particles:
@@ -65,9 +59,9 @@ class Sizes:
         return Sizes(
             diameter,
             chance,
-            _cumulative(density * chance, diameter),
-            _cumulative(density * chance * speeds, diameter),
-            _integral(density, diameter),
+            cumulative(density * chance, diameter),
+            cumulative(density * chance * speeds, diameter),
+            integral(density, diameter),
         )
 
     def draw(self, cumulative: Float[ndarray, "d"], count: int, rng: np.random.Generator) -> Float[ndarray, "n"]:
@@ -78,14 +72,6 @@ class Sizes:
     def represents(self, diameters: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
         """How many real particles one simulated particle of that size stands for."""
         return 1.0 / np.interp(diameters, self.diameters, self.chances)
-
-
-def _integral(density: Float[ndarray, "d"], at: Float[ndarray, "d"]) -> float:
-    return float(_cumulative(density, at)[-1])
-
-
-def _cumulative(density: Float[ndarray, "d"], at: Float[ndarray, "d"]) -> Float[ndarray, "d"]:
-    return np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(at))])
 
 
 def fill(sizes: Sizes, domain: Domain, rng: np.random.Generator) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n"]]:

@@ -1,177 +1,172 @@
-"""From one frame to the next: fly, land, leave, enter."""
+"""From one frame to the next: fly, meet the surface, slide, move as a whole, leave, enter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.physics.air import Air
 from pgsd_nerfstudio.physics.airborne import Flutter, advance
-from pgsd_nerfstudio.physics.chunks import LANDED, LEFT, SLID, Bodies, Chunk, State
-from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.contact import Ground
-from pgsd_nerfstudio.physics.emitters import Sizes, feed, fill
-from pgsd_nerfstudio.physics.wind import WindField
-from pgsd_nerfstudio.weather.effect import Effect
-from pgsd_nerfstudio.weather.snowfall import fall_speed
+from pgsd_nerfstudio.physics.chunks import ABSORBED, DENSE, LEFT, SLID, UNSEEN, Bodies, Chunk, State
+from pgsd_nerfstudio.physics.contact import Meeting
+from pgsd_nerfstudio.physics.deposits import Deposits
+from pgsd_nerfstudio.physics.log import Log
+from pgsd_nerfstudio.physics.sliding import LIFT, slide
+from pgsd_nerfstudio.physics.splash import splashed
+
+CLEAR = 0.01  # m off the surface at which what glides along it goes on
 
 
-@dataclass(frozen=True)
-class Air:
-    """What does not change during a run."""
-
-    domain: Domain
-    sizes: Sizes
-    wind: WindField
-    effect: Effect
-    ground: Ground
-    step: float
-    seed: int
-
-    def draws(self, frame: int) -> np.random.Generator:
-        """The randomness of one frame; the same however the run came there."""
-        return np.random.default_rng([self.seed, frame, 0x5704])
-
-    def settled(self, positions: ndarray, speeds: ndarray, time: float) -> Float[ndarray, "n 3"]:
-        """Velocity at which drag and gravity balance."""
-        velocity = self.wind.velocity(positions.astype(np.float64), time)
-        velocity[:, 2] -= speeds
-        return velocity
-
-    def newborn(self, born: int, positions: ndarray, diameters: ndarray, time: float, rng: np.random.Generator) -> Bodies:
-        """Particles at their settled velocity, with ids from `born` on."""
-        count, wind = len(diameters), self.effect.wind
-        speeds = fall_speed(diameters, self.effect.material)
-        draw = rng.uniform(size=(5, count))
-        values = (
-            positions,
-            self.settled(positions, speeds, time),
-            diameters,
-            speeds,
-            wind.flutter * (0.3 + 1.4 * draw[0]),
-            wind.flutter_hertz * (0.6 + 0.8 * draw[1]) * np.where(rng.uniform(size=count) < 0.5, -1.0, 1.0),
-            draw[2],
-            draw[3],
-            draw[4],
-        )
-        return Bodies(np.arange(born, born + count, dtype=np.int32), *(value.astype(np.float32) for value in values))
-
-
-def simulate_chunk(air: Air, state: State, start: int, frames: int) -> Chunk:
+def simulate_chunk(air: Air, deposits: Deposits, state: State, start: int, frames: int) -> Chunk:
     """Simulate `frames` frames from `start` on.
 
     Raises:
         ValueError: a position or velocity became NaN or infinite.
     """
-    first = state.born
-    rows: list[tuple[ndarray, ndarray, ndarray]] = []
-    births: list[tuple[int, Bodies]] = []
-    ends: list[tuple[ndarray, int, int]] = []
-    contacts: list[Bodies] = []
-    bodies, carry = Bodies.join([state.bodies]), state.carry  # a copy: flying changes it in place
-    born = first
+    deposits.restore(state.deposits)
+    log = Log(start, frames, state.born)
+    walk = _Walk(air, deposits, log, state)
     for frame in range(start, start + frames):
-        if frame == 0:
-            entering = _first(air)
-        else:
-            before = bodies.positions.copy()
-            _fly(air, bodies, frame)
-            stays, gone, landed, slid = _meet(air, before, bodies)
-            entering, carry = _enter(air, bodies.select(gone), born, carry, frame)
-            contacts.append(bodies.select(landed))
-            ends += [
-                (bodies.ids[gone], frame, LEFT),
-                (bodies.ids[landed], frame + 1, LANDED),
-                (bodies.ids[slid], frame + 1, SLID),
-            ]
-            seen = np.sort(np.concatenate([stays, landed, slid]))
-            rows.append((bodies.ids[seen], np.full(len(seen), frame, np.int32), bodies.positions[seen]))
-            bodies = bodies.select(stays)
-        births.append((frame, entering))
-        rows.append((entering.ids, np.full(len(entering), frame, np.int32), entering.positions.copy()))
-        born += len(entering)
-        bodies = Bodies.join([bodies, entering])
-        _check(bodies, frame)
-    new = Bodies.join([entering for _, entering in births])
-    lying = Bodies.join([*contacts, Bodies.none()])
-    rest = air.ground.rest(lying.positions, lying.spins)
-    quats = np.random.default_rng([air.seed, start, 0x0417]).normal(size=(born - first, 4))
-    return Chunk(
-        start=start,
-        frames=frames,
-        row_ids=np.concatenate([row[0] for row in rows]),
-        row_frames=np.concatenate([row[1] for row in rows]),
-        row_positions=np.concatenate([row[2] for row in rows]),
-        births=np.concatenate([np.full(len(entering), frame, np.int32) for frame, entering in births]),
-        diameters=new.diameters,
-        represents=air.sizes.represents(new.diameters).astype(np.float32),
-        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
-        ended_ids=np.concatenate([np.zeros(0, np.int32), *(ids for ids, _, _ in ends)]),
-        ended_frames=np.concatenate([np.zeros(0, np.int32), *(np.full(len(ids), end, np.int32) for ids, end, _ in ends)]),
-        ended_how=np.concatenate([np.zeros(0, np.uint8), *(np.full(len(ids), how, np.uint8) for ids, _, how in ends)]),
-        rest_ids=lying.ids,
-        rest_positions=rest.positions,
-        rest_quats=rest.quats,
-        rest_extents=rest.extents,
-        state=State(bodies, born, carry),
-    )
+        walk.begin() if frame == 0 else walk.advance(frame)
+    return log.chunk(air.ground, air.seed, walk.state())
 
 
-def _first(air: Air) -> Bodies:
-    """The air of frame 0: as if it had snowed for long, so nothing is below a roof or under the ground."""
-    rng = air.draws(0)
-    positions, diameters = fill(air.sizes, air.domain, rng)
-    came_from = -air.settled(positions, fall_speed(diameters, air.effect.material), 0.0)
-    free = air.ground.open_above(positions, came_from)
-    return air.newborn(0, positions[free], diameters[free], 0.0, rng)
+class _Walk:
+    """Particles on their way through the frames of a chunk."""
 
+    def __init__(self, air: Air, deposits: Deposits, log: Log, state: State) -> None:
+        self.air, self.deposits, self.log = air, deposits, log
+        self.flying = Bodies.join([state.flying])  # a copy: flying changes it in place
+        self.sliding, self.dense, self.carry = state.sliding, state.dense, state.carry
 
-def _fly(air: Air, bodies: Bodies, frame: int) -> None:
-    flutter = Flutter(bodies.sways, bodies.hertz, bodies.phases)
-    advance(bodies.positions, bodies.velocities, bodies.speeds, flutter, air.wind, (frame - 1) * air.step, air.step)
+    def state(self) -> State:
+        return State(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born, self.carry)
 
+    def begin(self) -> None:
+        """Frame 0: the air is full."""
+        self.flying = self.log.enter(self.air.first(), 0)
 
-def _meet(air: Air, before: Float[ndarray, "n 3"], bodies: Bodies) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Which particles fly on, leave, land and slide off; those that touched are put at their contact."""
-    meeting = air.ground.meet(before, bodies.positions)
-    bodies.positions[meeting.which] = meeting.points
-    hold = air.ground.holds(meeting.normals, bodies.holds[meeting.which])
-    lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
-    out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
-    out[meeting.which] = False
-    flies = ~out
-    flies[meeting.which] = False
-    return flies.nonzero()[0], out.nonzero()[0], meeting.which[hold], meeting.which[~hold]
+    def advance(self, frame: int) -> None:
+        """From the frame before to `frame`."""
+        air, log = self.air, self.log
+        before = self.flying.positions.copy()
+        self._fly(frame)
+        meeting = air.ground.meet(before, self.flying.positions, self.deposits.cover)
+        self.flying.positions[meeting.which] = meeting.points
+        aloft, gone = self._leave(meeting, frame)
+        took_off = self._slide(frame)
+        self._move_dense(frame)
+        touched = self.flying.select(meeting.which)
+        flying, droplets = self._touch(touched, meeting, frame)
+        entering, self.carry = air.entering(gone, self.carry, frame)
+        log.see(aloft, frame)
+        stay = Bodies.join([aloft, took_off, flying])
+        self.flying = Bodies.join([stay, log.enter(droplets, frame), log.enter(entering, frame)])
+        self.deposits.age(air.step)
+        for bodies in (self.flying, self.sliding, self.dense):
+            _check(bodies, frame)
 
+    def _fly(self, frame: int) -> None:
+        air, bodies = self.air, self.flying
+        flutter = Flutter(bodies.sways, bodies.hertz, bodies.phases)
+        advance(bodies.positions, bodies.velocities, bodies.speeds, flutter, air.wind, (frame - 1) * air.step, air.step)
+        spread = np.sqrt(2 * air.effect.wind.diffusivity * air.step)
+        if spread > 0:
+            walk = air.draws(frame, 0xD1FF).normal(scale=spread, size=bodies.positions.shape)
+            bodies.positions[:] += walk.astype(np.float32)
 
-def _enter(air: Air, gone: Bodies, born: int, carry: float, frame: int) -> tuple[Bodies, float]:
-    """New particles: through the top, and opposite to where others left through a side."""
-    rng, time = air.draws(frame), frame * air.step
-    lower, size = np.asarray(air.domain.lower), np.asarray(air.domain.size)
-    positions, diameters, share, carry = feed(air.sizes, air.domain, carry, air.step, rng)
-    fallen = air.settled(positions, fall_speed(diameters, air.effect.material), time)
-    positions = positions + fallen * (share * air.step)[:, None]
-    positions[:, :2] = lower[:2] + (positions[:, :2] - lower[:2]) % size[:2]
-    fed = air.newborn(born, positions, diameters, time, rng)
+    def _leave(self, meeting: Meeting, frame: int) -> tuple[Bodies, Bodies]:
+        """What stays in the air untouched, and what left the box of air; what no camera can see any more ends too."""
+        air, bodies, log = self.air, self.flying, self.log
+        lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
+        out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
+        touched = np.zeros(len(bodies), bool)
+        touched[meeting.which] = True
+        unseen = ~touched & ~out & ~air.sight.needed(bodies.positions)
+        gone = bodies.select(out & ~touched)
+        log.end(gone, frame, LEFT)
+        log.end(bodies.select(unseen), frame, UNSEEN)
+        return bodies.select(~(touched | out | unseen)), gone
 
-    inside = (gone.positions[:, 2] >= lower[2]) & (gone.positions[:, 2] <= air.domain.upper[2])
-    wrapped = gone.positions.astype(np.float64)
-    wrapped[:, :2] = lower[:2] + (wrapped[:, :2] - lower[:2]) % size[:2]
-    came_from = -air.settled(wrapped, gone.speeds, time)
-    inside &= air.ground.open_above(wrapped, came_from)
-    blown = gone.select(inside)
-    blown = Bodies(
-        np.arange(born + len(fed), born + len(fed) + len(blown), dtype=np.int32),
-        wrapped[inside].astype(np.float32),
-        *(getattr(blown, name) for name in ("velocities", "diameters", "speeds", "sways", "hertz", "phases", "holds", "spins")),
-    )
-    return Bodies.join([fed, blown]), carry
+    def _slide(self, frame: int) -> Bodies:
+        """Move sliders; returns those that fly again. Those that found rest lie down."""
+        air, log = self.air, self.log
+        moved = slide(self.sliding, air.ground.surface, air.effect.surface.friction, air.step)
+        log.see(moved.bodies, frame)
+        rests = moved.rests
+        self._lie(moved.bodies.select(rests), frame)
+        self.sliding = moved.bodies.select(~(rests | moved.flies))
+        return moved.bodies.select(moved.flies)
+
+    def _move_dense(self, frame: int) -> None:
+        """Hand crowded sliders over, and move what is dense as a whole."""
+        matter, log = self.deposits.dense, self.log
+        if matter is None:
+            return
+        volumes = self.deposits.volumes(self.sliding)
+        crowded = matter.crowded(self.sliding, volumes, self.dense, self.deposits.volumes(self.dense))
+        if len(self.dense):
+            moved = matter.step(self.air.step)
+            bodies = replace(
+                self.dense,
+                positions=moved.positions.astype(np.float32),
+                velocities=moved.velocities.astype(np.float32),
+            )
+            log.see(bodies.select(~moved.left), frame)
+            log.end(bodies.select(moved.left), frame, LEFT)
+            self._lie(bodies.select(moved.rests), frame, heaped=True)
+            self.dense = bodies.select(~(moved.rests | moved.left))
+        if crowded.any():
+            handed = self.sliding.select(crowded).marked(DENSE)
+            log.become(handed)
+            matter.add(handed, volumes[crowded])
+            self.sliding = self.sliding.select(~crowded)
+            self.dense = Bodies.join([self.dense, handed])
+
+    def _touch(self, touched: Bodies, meeting: Meeting, frame: int) -> tuple[Bodies, Bodies]:
+        """What happens to particles at their contacts; returns those that fly on, and new droplets without ids."""
+        air, log, response = self.air, self.log, self.air.effect.surface
+        log.see(touched, frame)
+        if response.landing == "glides":
+            into = (touched.velocities * meeting.normals).sum(1, keepdims=True)
+            return (
+                replace(
+                    touched,
+                    positions=(touched.positions + CLEAR * meeting.normals).astype(np.float32),
+                    velocities=(touched.velocities - into * meeting.normals).astype(np.float32),
+                ),
+                Bodies.none(),
+            )
+        if response.landing == "wets":
+            droplets, share = Bodies.none(), np.zeros(len(touched))
+            if response.splash is not None:
+                rng = air.draws(frame, 0x59A5)
+                droplets, share = splashed(air, response.splash, touched, meeting.normals, rng)
+            self.deposits.wet(touched, 1 - share)
+            log.end(touched, frame + 1, ABSORBED)
+            return Bodies.none(), droplets
+        hold = air.ground.holds(meeting.normals, touched.holds)
+        self._lie(touched.select(hold), frame)
+        slips = touched.select(~hold).marked(SLID)
+        normals = meeting.normals[~hold]
+        along = slips.velocities - (slips.velocities * normals).sum(1, keepdims=True) * normals
+        # Off the surface, on the side from which they came: sliding has no other memory of it.
+        lifted = slips.positions + LIFT * normals
+        slips = replace(slips, positions=lifted.astype(np.float32), velocities=along.astype(np.float32))
+        log.become(slips)
+        self.sliding = Bodies.join([self.sliding, slips])
+        return Bodies.none(), Bodies.none()
+
+    def _lie(self, bodies: Bodies, frame: int, *, heaped: bool = False) -> None:
+        """Particles whose way ends here, on the cover that they make thicker."""
+        self.log.land(bodies, self.deposits.lay(bodies, heaped=heaped), frame)
 
 
 def _check(bodies: Bodies, frame: int) -> None:
     for name in ("positions", "velocities"):
-        bad = int((~np.isfinite(getattr(bodies, name))).any(1).sum())
+        values: ndarray = getattr(bodies, name)
+        bad = int((~np.isfinite(values)).any(1).sum())
         if bad:
             raise ValueError(f"the {name} of {bad} particles are NaN or infinite in frame {frame}")

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pgsd_nerfstudio.physics.codec import Steps, decode, encode
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 
@@ -49,12 +50,16 @@ class ParticleHistory:
     """Orientation at rest, wxyz: the local z axis is the surface normal, spin about it is random."""
     rest_extents: Float[Tensor, "p"]
     """Radius in metres over which the surface around the contact is flat and unbroken."""
+    rest_covers: Float[Tensor, "p"]
+    """Thickness along z in metres of the cover on which it lies; zero where there is none."""
     quats: Float[Tensor, "p 4"]
     """Orientation in flight, wxyz."""
     diameters: Float[Tensor, "p"]
     """Metres."""
     represents: Float[Tensor, "p"]
     """How many real particles each one stands for."""
+    kinds: Int[Tensor, "p"]
+    """What it ever was, uint8 bits: 1 droplet of a splash, 2 slid, 4 dense matter."""
     fps: float
     frames: int
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -74,6 +79,11 @@ class ParticleHistory:
     @property
     def device(self) -> torch.device:
         return self.positions.device
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all tensors in bytes."""
+        return sum(getattr(self, name).nbytes for name in _TENSORS)
 
     def active(self, frame: int) -> Int[Tensor, "n"]:
         """Ids of the particles in the air at `frame`, ascending."""
@@ -124,24 +134,40 @@ class ParticleHistory:
                 raise ValueError(f"{name} of particle {particle} are not finite in frame {frame}: {value[row].tolist()}")
 
     def save(self, path: Path) -> None:
-        """Write one safetensors file, atomically."""
-        tensors = {name: getattr(self, name) for name in _TENSORS}
-        save_tensors(path, tensors, {**self.about, "fps": self.fps, "frames": self.frames, "format": _FORMAT})
+        """Write one safetensors file, atomically; positions are rounded to the lattice of `codec`.
+
+        Raises:
+            ValueError: a position is NaN or infinite.
+            OSError: the file could not be written.
+        """
+        *lists, exponent = encode(self.positions.numpy(force=True), self.offsets.numpy(force=True))
+        tensors = {name: getattr(self, name) for name in _TENSORS if name != "positions"}
+        tensors |= {name: torch.from_numpy(steps) for name, steps in zip(_LISTS, lists, strict=True)}
+        plain = {"fps": self.fps, "frames": self.frames, "exponent": exponent, "format": _FORMAT}
+        save_tensors(path, tensors, {**self.about, **plain})
 
     @staticmethod
     def load(path: Path) -> ParticleHistory | None:
         """A saved history; None where there is none, or where the file is damaged or of another format."""
         stored = load_tensors(path)
-        if stored is None or stored[1].get("format") != _FORMAT or set(_TENSORS) - set(stored[0]):
+        if stored is None or stored[1].get("format") != _FORMAT or _STORED - set(stored[0]):
             return None
         tensors, about = stored
         about = dict(about)
         del about["format"]
-        return ParticleHistory(**tensors, fps=about.pop("fps"), frames=about.pop("frames"), about=about)
+        one, two, four = (tensors.pop(name).numpy() for name in _LISTS)
+        try:
+            positions = torch.from_numpy(decode(Steps(one, two, four, about.pop("exponent")), tensors["offsets"].numpy()))
+        except ValueError:  # damaged
+            return None
+        fps, frames = about.pop("fps"), about.pop("frames")
+        return ParticleHistory(**tensors, positions=positions, fps=fps, frames=frames, about=about)
 
     def _rows(self, frame: int, ids: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
         return self.offsets[ids] + (frame - self.births[ids])
 
 
-_FORMAT = 1
+_FORMAT = 2
 _TENSORS = tuple(f.name for f in fields(ParticleHistory) if f.name not in ("fps", "frames", "about"))
+_LISTS = ("steps", "steps_two", "steps_four")  # in a file these stand for the positions
+_STORED = (set(_TENSORS) - {"positions"}) | set(_LISTS)

@@ -7,19 +7,19 @@ from typing import Any
 import torch
 
 from pgsd_nerfstudio.physics.airborne import GRAVITY
+from pgsd_nerfstudio.physics.chunks import SPLASHED
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.weather.effect import Material
-from pgsd_nerfstudio.weather.snowfall import mass
 
 
 def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
     """Plain values for JSON. Mass, momentum and energy are those of the real particles that the simulated ones stand for.
 
-    Lists have one number for each frame: particles `in_air` and `resting`; `mass_in_air` and `mass_resting` in kg; `momentum`
+    Lists have one number for each frame: particles `in_air` (all on their way) and `resting`; `mass_in_air` and
+    `mass_resting` in kg; `momentum`
     [3] in kg m/s and `kinetic_energy` in J of what is in the air; `potential_energy` in J of all, above height 0.
     """
-    masses = torch.from_numpy(mass(history.diameters.double().numpy(force=True), material))
-    masses = masses * history.represents.double().cpu()
+    masses = material.mass(history.diameters.double().cpu()) * history.represents.double().cpu()
     rows: dict[str, list[Any]] = {
         name: []
         for name in ("in_air", "resting", "mass_in_air", "mass_resting", "momentum", "kinetic_energy", "potential_energy")
@@ -38,7 +38,10 @@ def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
         potential = (heavy * heights).sum() + (masses[lying.cpu()] * resting_heights).sum()
         rows["potential_energy"].append(GRAVITY * float(potential))
     ended = history.ends.cpu() < history.frames
-    gone = float(masses[ended & ~history.collided.cpu()].sum())
+    # Droplets of a splash are part of drops that have ended: what such a drop left behind is the rest of it.
+    droplets = (history.kinds.cpu() & SPLASHED) > 0
+    emitted = float(masses[~droplets].sum())
+    gone = float(masses[ended & ~history.collided.cpu()].sum()) - float(masses[droplets].sum())
     return {
         "about": dict(history.about),
         "frames": history.frames,
@@ -46,8 +49,8 @@ def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
         "particles": len(history),
         "particle_frames": int(history.positions.shape[0]),
         "bytes": sum(t.nbytes for t in vars(history).values() if isinstance(t, torch.Tensor)),
-        "mass_emitted": float(masses.sum()),
+        "mass_emitted": emitted,
         "mass_gone": gone,
-        "mass_lost": float(masses.sum()) - gone - rows["mass_in_air"][-1] - rows["mass_resting"][-1],
+        "mass_lost": emitted - gone - rows["mass_in_air"][-1] - rows["mass_resting"][-1],
         "per_frame": rows,
     }

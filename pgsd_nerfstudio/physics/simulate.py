@@ -1,4 +1,4 @@
-"""The motion prior: weather simulated in the air around a scene, from full air at frame 0 to the last frame.
+"""Weather simulated in the air around a scene, from full air at frame 0 to the last frame.
 
 Frames are simulated in chunks. A chunk is a pure function of the state at its start, and the randomness of a frame comes from
 the seed and the number of the frame alone; so an interrupted run goes on from its last stored chunk and ends with the same
@@ -7,10 +7,10 @@ bits.
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,23 +19,29 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from pgsd_nerfstudio.physics.air import Air
 from pgsd_nerfstudio.physics.chunks import Chunk, State, assemble, load_chunk, save_chunk
-from pgsd_nerfstudio.physics.clock import Clock, Domain, domain_of
+from pgsd_nerfstudio.physics.clock import Clock, Domain
 from pgsd_nerfstudio.physics.contact import Ground
+from pgsd_nerfstudio.physics.deflection import Deflection
+from pgsd_nerfstudio.physics.deposits import Deposits
 from pgsd_nerfstudio.physics.emitters import Sizes
-from pgsd_nerfstudio.physics.flight import Air, simulate_chunk
+from pgsd_nerfstudio.physics.flight import simulate_chunk
 from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.physics.populations import fall_speed
+from pgsd_nerfstudio.physics.sight import Sight
 from pgsd_nerfstudio.physics.wind import WindField
-from pgsd_nerfstudio.storage import cache_dir, content_key
+from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.weather.effect import Effect
 
 if TYPE_CHECKING:
-    from pgsd_nerfstudio.scene.scene import Scene
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 MAX_PARTICLES = 20_000  # in the air at once: what a CPU renders and refines in reasonable time
 CHUNK = 25  # frames that an interruption may cost
-_REVISION = 1  # of what is computed; a stored history of another revision is not used
+SIGHT = 20.0  # m; a particle farther from every camera than this is not seen
+LEAST_GUSTS = 0.35  # gustiness that the region of sight allows for at least
+SIGHT_MARGIN = 0.5  # m around what cameras see: training clips leave their cameras' straight ways by no more
 
 console = Console(stderr=True, highlight=False)
 
@@ -48,6 +54,7 @@ def simulate(
     *,
     seed: int = 0,
     max_particles: int | None = None,
+    cameras: Cameras | None = None,
     progress: bool = True,
     resume: Path | None = None,
 ) -> ParticleHistory:
@@ -56,6 +63,7 @@ def simulate(
     Args:
         surface: what particles land on, in metres; may be empty, then nothing lands.
         max_particles: most particles in the air at once; each then represents several real ones. None: MAX_PARTICLES.
+        cameras: in metres; particles that none of them can come to see are left out. None: all are simulated.
         progress: show a bar.
         resume: folder in which chunks are kept until the run is complete; None keeps nothing.
 
@@ -72,19 +80,21 @@ def simulate(
     with _one_thread(), _bar(progress) as bar:
         air = Air(
             domain=domain,
-            sizes=Sizes.of(effect, domain.volume, max_particles),
-            wind=WindField.draw(effect.wind, seed),
+            sizes=Sizes.of(effect, domain.volume, min(max_particles, effect.emission.most or max_particles)),
+            wind=WindField.draw(effect.wind, seed, Deflection.of(surface, domain, effect.wind)),
             effect=effect,
             ground=Ground.of(surface, effect.surface, domain),
+            sight=_sight(effect, domain, cameras),
             step=clock.step,
             seed=seed,
         )
+        deposits = Deposits(effect, surface, domain)
         task = bar.add_task(f"simulating {effect.name}", total=clock.frames)
         for index, start in enumerate(starts):
             frames = min(CHUNK, clock.frames - start)
             chunk = load_chunk(resume, index, start, frames) if resume is not None else None
             if chunk is None:
-                chunk = simulate_chunk(air, state, start, frames)
+                chunk = simulate_chunk(air, deposits, state, start, frames)
                 if resume is not None and not save_chunk(resume, index, chunk):
                     last = start + frames - 1
                     console.print(f"[yellow]could not store frames {start}-{last} in {resume}: going on[/]", soft_wrap=True)
@@ -92,11 +102,16 @@ def simulate(
             chunks.append(chunk)
             state = chunk.state
             bar.update(task, completed=start + frames)
+    deposits.restore(state.deposits)  # the last chunk may have come from the disk
     about = {
+        "profile": "metric",
         "effect": effect.name,
         "seed": seed,
-        "intensity_mm_per_hour": effect.emission.intensity,
+        "intensity": effect.emission.intensity,
+        "unit": effect.emission.unit,
         "domain": [*domain.lower, *domain.upper],
+        "air_simulated": air.sight.share,
+        **deposits.summary(),
         "seconds": time.perf_counter() - began,
     }
     history = assemble(chunks, clock, about)
@@ -104,63 +119,14 @@ def simulate(
     return history
 
 
-def motion_prior(
-    scene: Scene,
-    surface: SurfaceMesh,
-    effect: Effect,
-    clock: Clock,
-    *,
-    seed: int = 0,
-    max_particles: int | None = None,
-    cache: bool = True,
-    progress: bool = True,
-) -> ParticleHistory:
-    """The simulated motion of an effect in a scene; simulated once and then read from the cache.
-
-    An interrupted simulation goes on where it was; a damaged file is made again. Prints one line about the result.
-    """
-    domain = domain_of(scene)
-    max_particles = MAX_PARTICLES if max_particles is None else max_particles
-    parts = (effect.emission, effect.material, effect.wind, effect.surface)
-    key = content_key(
-        "motion prior", _REVISION, surface.vertices, surface.triangles, effect.name, *parts, clock, domain, seed, max_particles
-    )
-    stored, folder = cache_dir() / "motion" / f"{key}.safetensors", cache_dir() / "motion" / key
-    history = ParticleHistory.load(stored) if cache else None
-    found = history is not None
-    if history is None:
-        history = simulate(
-            surface,
-            effect,
-            clock,
-            domain,
-            seed=seed,
-            max_particles=max_particles,
-            progress=progress,
-            resume=folder if cache else None,
-        )
-        if cache:
-            try:
-                history.save(stored)
-                shutil.rmtree(folder, ignore_errors=True)
-            except OSError as error:
-                console.print(f"[yellow]the motion prior is not kept: {error}[/]")
-    if progress:
-        console.print(summary(history) + (f" (from {stored})" if found else ""), soft_wrap=True)
-    return history
-
-
-def summary(history: ParticleHistory) -> str:
-    """One line: how many particles, how many at once, how many landed, what each stands for, how long it took."""
-    births, ends = history.births.numpy(force=True), history.ends.numpy(force=True)
-    change = np.bincount(births, minlength=history.frames + 1) - np.bincount(ends, minlength=history.frames + 1)
-    active = np.cumsum(change)[: history.frames]
-    about = history.about
-    return (
-        f"{about.get('effect', 'motion prior')}: {len(history):,} particles over {history.frames} frames, "
-        f"{active.mean():,.0f} in the air on average (at most {active.max():,}), {int(history.collided.sum()):,} landed, "
-        f"each stands for {float(history.represents.mean()):.3g} real ones, {about.get('seconds', 0.0):.1f} s"
-    )
+def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
+    if cameras is None:
+        return Sight.everything()
+    # Around obstacles the wind turns aside and up, which the region knows nothing of; the allowance for gusts covers it.
+    wind = replace(effect.wind, gustiness=max(effect.wind.gustiness, LEAST_GUSTS))
+    ends = np.array([effect.emission.smallest, effect.emission.largest])
+    slowest, fastest = (float(speed) for speed in np.sort(fall_speed(ends, effect.material)))
+    return Sight.of(domain, cameras, distance=SIGHT, margin=SIGHT_MARGIN, slowest=slowest, fastest=fastest, wind=wind)
 
 
 @contextmanager

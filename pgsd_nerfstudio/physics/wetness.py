@@ -173,7 +173,8 @@ class WetnessGrid:
         for offset in np.ndindex(2, 2, 2):
             lattice = corner + offset
             inside = np.all((lattice >= 0) & (lattice < self.shape), axis=1)
-            key = np.ravel_multi_index(tuple(np.where(inside[:, None], lattice, 0).astype(np.int64).T), self.shape)
+            at_edge = tuple(np.where(inside[:, None], lattice, 0).astype(np.int64).T)
+            key = np.asarray(np.ravel_multi_index(at_edge, self.shape))
             cell, exists = self._find(key)
             cells.append(cell)
             weights.append(np.where(exists & inside, np.where(offset, share, 1 - share).prod(1), 0.0))

@@ -5,18 +5,26 @@ u = curl A: free of divergence whatever g is, with g chosen to calm the air at t
 their energy follows Kolmogorov's -5/3 law (Kraichnan, "Diffusion by a random velocity field", 1970, is the same construction in
 free air), and U t carries the pattern along (Taylor's frozen flow). The mean wind follows the logarithmic law of the wall.
 Everything is a function of place and time: no state to store, any frame can be computed alone.
+
+Where obstacles stand in the way (`deflection`) the mean wind goes around them, and the potential of the turbulence is ramped
+down beside them, as g does above the ground: also free of divergence (Bridson, Hourihan & Nordenstam, "Curl-noise for
+procedural fluid flow", 2007).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.weather.effect import Wind
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.physics.deflection import Deflection
 
 CALM = 0.6  # m above ground below which turbulence dies out
 GUST_WAVES = 6
@@ -42,10 +50,12 @@ class WindField:
     gustiness: float
     reference_height: float
     roughness: float
+    deflection: Deflection | None = None
+    """How obstacles turn it aside; None in open country."""
 
     @staticmethod
-    def draw(wind: Wind, seed: int) -> WindField:
-        """The wind of that seed."""
+    def draw(wind: Wind, seed: int, deflection: Deflection | None = None) -> WindField:
+        """The wind of that seed, around those obstacles if given."""
         rng = np.random.default_rng([seed, 0x317D])
         count = max(wind.modes, 0) if wind.turbulence > 0 else 0
         magnitude = np.geomspace(1 / wind.largest_eddy, 1 / wind.smallest_eddy, count) if count else np.zeros(0)
@@ -72,11 +82,17 @@ class WindField:
             gustiness=wind.gustiness,
             reference_height=wind.reference_height,
             roughness=wind.roughness,
+            deflection=deflection,
         )
 
     def still(self) -> WindField:
         """The same field with nothing moving; for tests and figures."""
         return replace(self, swirls=0 * self.swirls, potentials=0 * self.potentials, mean=0 * self.mean)
+
+    @property
+    def undisturbed(self) -> WindField:
+        """The same wind over open ground."""
+        return replace(self, deflection=None)
 
     def at_reference(self, time: float) -> Float[ndarray, "2"]:
         """Mean wind with its gusts at the reference height, m/s."""
@@ -91,15 +107,23 @@ class WindField:
 
     def velocity(self, points: Float[ndarray, "n 3"], time: float) -> Float[ndarray, "n 3"]:
         """Air velocity in m/s; the plain form that the kernel of `airborne` is judged by."""
-        height = points[:, 2].clip(0.0)
-        profile = np.log1p(height / self.roughness) / math.log1p(self.reference_height / self.roughness)
+        profile = law_of_the_wall(points[:, 2], self.roughness, self.reference_height)
         calm, slope = calming(points[:, 2])
         angle = 2 * math.pi * (points @ self.waves.T + self.phases_at(time))
         swirl = np.cos(angle) @ self.swirls
         lifted = np.sin(angle) @ np.stack([-self.potentials[:, 1], self.potentials[:, 0], 0 * self.phases], 1)
         velocity = calm[:, None] * swirl + slope[:, None] * lifted
+        if self.deflection is not None:
+            shelter, ramp = self.deflection.shelter(points)
+            rise = np.cross(calm[:, None] * ramp, np.sin(angle) @ self.potentials)
+            velocity = shelter[:, None] * velocity + rise + self.deflection.velocity(points, self.at_reference(time))
         velocity[:, :2] += profile[:, None] * self.at_reference(time)
         return velocity
+
+
+def law_of_the_wall(height: Float[ndarray, "n"], roughness: float, reference_height: float) -> Float[ndarray, "n"]:
+    """Mean wind over open ground as a share of that at the reference height: logarithmic, 0 on and below the ground."""
+    return np.log1p(height.clip(0.0) / roughness) / math.log1p(reference_height / roughness)
 
 
 def calming(height: Float[ndarray, "n"]) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:

@@ -30,14 +30,23 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
     Raises:
         RunError: the scene cannot hold this weather, or the disk is full.
     """
-    from pgsd_nerfstudio.physics.simulate import motion_prior
+    from pgsd_nerfstudio.physics.prior import motion_prior
     from pgsd_nerfstudio.surface.mesh import surface_of
 
     try:
         surface = surface_of(stage.scene, stage.rasterizer)
         clock = Clock(fps=options.fps, frames=options.frames)
         effect, most = options.chosen_effect(), options.max_particles
-        history = motion_prior(stage.scene, surface, effect, clock, seed=options.weather_seed, max_particles=most)
+        history = motion_prior(
+            stage.scene,
+            surface,
+            effect,
+            clock,
+            seed=options.weather_seed,
+            max_particles=most,
+            profile=options.physics,
+            everything=options.everything,
+        )
         made_for = {"splat": _splat_key(stage.scene), "frame": _written(stage.scene.frame)}
         history = replace(history, about={**history.about, **made_for})
         if run_folder is not None:

@@ -36,7 +36,8 @@ class WeatherOptions:
     effect: str = "snowfall"
     """Which weather."""
     intensity: float | None = None
-    """How much falls, in mm/h of liquid water (light snow 1, heavy snow 3); by default what the effect says."""
+    """How much: snow and rain in mm/h of liquid water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres
+    (dense fog 60); by default what the effect says."""
     exposure: float | None = None
     """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default what the effect
     says, which for snow is 0, no motion blur."""
@@ -46,6 +47,11 @@ class WeatherOptions:
     """Frames of weather per second, as in the paper's videos."""
     max_particles: int = 100_000 if CUDA else 8_000
     """At most this many particles are in the air at once, each then standing for several; bounds the time of every step."""
+    physics: Literal["metric", "paper"] = "metric"
+    """How the weather moves: metric is right in SI units; paper is the publication's solver and numbers (MPM throughout in a
+    unit cube, no air), to compare with."""
+    everything: bool = False
+    """Simulate also the air that no training camera can see; costs time, and free camera paths see weather everywhere."""
     weather_seed: int = 0
     """Another seed, another snowfall of the same kind. (--machine.seed varies the training only.)"""
     prior: str = "bundled"
@@ -152,11 +158,14 @@ class WeatherOptions:
             "seconds",
             "fps",
             "max_particles",
+            "physics",
             "weather_seed",
         ):
             value = getattr(self, name)
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]
+        if self.everything:
+            words.append("--everything")
         return shlex.join(words)
 
 

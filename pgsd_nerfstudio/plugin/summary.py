@@ -15,13 +15,12 @@ from pgsd_nerfstudio.plugin.stage import Stage
 
 def print_summary(console: Console, options: WeatherOptions, stage: Stage, history: ParticleHistory, guide: Guide) -> None:
     """Print the table and, on a CPU, what the shell should say to OpenMP."""
-    scene = stage.scene
+    scene, emission = stage.scene, options.chosen_effect().emission
     rows = {
         "scene": f"{options.load_scene} ({len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views), {scene.description}",
         "scale and ground": scene.frame.source,
         "device": str(stage.device),
-        "weather": f"{options.effect}, {options.chosen_effect().emission.intensity:g} mm/h, "
-        f"{options.seconds:g} s at {options.fps:g} fps",
+        "weather": f"{options.effect}, {emission.intensity:g} {emission.unit}, {options.seconds:g} s at {options.fps:g} fps",
         "particles": f"{len(history):,} ({int(history.collided.sum()):,} of them land)",
         "video prior": f"{guide.prior.name}",
         "wanted": guide.wanted,

@@ -2,20 +2,23 @@
 
 Flakes in the air take their size from the diameter that the physics drew for them: near ones are seen as flakes of several
 pixels, far ones as faint dots. On the surface every flake spreads into a thin soft patch which stands for the water that would
-have gathered there (Appearance.accumulation_speedup); patches of many sizes and tones overlap into a layer.
+have gathered there (SurfaceResponse.accumulation_speedup); patches of many sizes and tones overlap into a layer.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.special import spence
 from torch import Tensor
 
 from pgsd_nerfstudio.weather.effect import Effect, StateLook
+from pgsd_nerfstudio.weather.matter import Array
 
 
 class Particles(Protocol):
@@ -84,6 +87,9 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     generator = torch.Generator().manual_seed(seed)
     looks, diameters = effect.appearance, particles.diameters.cpu().float()
     active = _look(looks.active, _flake_scales(looks.active, diameters), generator)
+    if looks.active.opacity is None:
+        shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one
+        active = ParticleLook(opacity_of_extinction(shadow, active.scales), active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
     # No patch wider than the surface around it: nothing hangs over the edge of a table.
     widest = (particles.rest_extents.cpu() / REACH).clamp_min(0.004)
@@ -91,6 +97,21 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     scales[:, 2] = torch.minimum(scales[:, 2], 0.5 * scales[:, :2].amin(1))
     collided = ParticleLook(collided.opacity, scales, collided.rgb)
     return InitialLook(active, collided, looks.collided.settle_seconds).to(particles.diameters.device)
+
+
+FAINTEST = 1.0 / 255.0  # opacity below which a rasterizer draws nothing
+
+
+def opacity_of_extinction(cross_section: Float[Tensor, "p"], scales: Float[Tensor, "p 3"]) -> Float[Tensor, "p"]:
+    """Opacity with which a Gaussian takes as much light out of a view as `cross_section` m^2 of black area spread over it.
+
+    Many such Gaussians then obey Beer-Lambert. The optical depth -ln(1 - a g) of a splat a g, g = exp(-r^2 / 2), integrates to
+    2 pi s^2 (Li2(a) - Li2(1 / 255)), since what is fainter than 1 / 255 is not drawn; s^2 by the geometric mean of the axes.
+    """
+    wanted = cross_section.double() / (2 * math.pi * scales.double().prod(1) ** (2 / 3))
+    opacity = np.linspace(FAINTEST, 0.99, 4096)
+    depth = spence(1 - opacity) - spence(1 - FAINTEST)  # Li2(z) = spence(1 - z)
+    return torch.from_numpy(np.interp(wanted.numpy(), depth, opacity)).float()
 
 
 REACH = 1.7  # standard deviations at which a patch of opacity 0.6 has faded to 0.14: where it seems to end
@@ -104,14 +125,19 @@ def _flake_scales(state: StateLook, diameters: Float[Tensor, "p"]) -> Float[Tens
 
 def _patch_scales(effect: Effect, diameters: Float[Tensor, "p"], represents: Float[Tensor, "p"]) -> Float[Tensor, "p 3"]:
     """A patch has the volume of the snow it stands for: (2 pi)^(3/2) times the product of its standard deviations."""
-    look, material = effect.appearance, effect.material
-    if look.collided.scale_m is not None:
-        return torch.tensor(look.collided.scale_m).expand(len(diameters), 3)
-    kilograms = 1e-6 * material.mass_milligram * (1e3 * diameters) ** material.mass_exponent
-    volume = represents * kilograms * look.accumulation_speedup / look.layer_density
-    thin = look.layer_thickness / math.sqrt(2 * math.pi)
-    flat = (volume / (2 * math.pi * look.layer_thickness)).sqrt()
+    if effect.appearance.collided.scale_m is not None:
+        return torch.tensor(effect.appearance.collided.scale_m).expand(len(diameters), 3)
+    thickness = effect.surface.layer_thickness
+    flat = (layer_volume(effect, diameters, represents) / (2 * math.pi * thickness)).sqrt()
+    thin = thickness / math.sqrt(2 * math.pi)
     return torch.stack([flat, flat, torch.full_like(flat, thin)], 1)
+
+
+def layer_volume(effect: Effect, diameters: Array, represents: Array) -> Array:  # [p]
+    """m^3 of cover that landed particles stand for; arrays or tensors."""
+    layer = effect.surface
+    volumes: Any = represents * effect.material.mass(diameters) * (layer.accumulation_speedup / layer.layer_density)
+    return volumes
 
 
 def _look(state: StateLook, base: Float[Tensor, "p 3"], generator: torch.Generator) -> ParticleLook:
@@ -119,7 +145,7 @@ def _look(state: StateLook, base: Float[Tensor, "p 3"], generator: torch.Generat
     # One draw for the size as a whole, a weaker one for the ratio of the flat axes: flakes are not discs.
     shape = 0.5 * state.scale_spread * normal[:, 1]
     log = state.scale_spread * normal[:, :1] + torch.stack([shape, -shape, torch.zeros_like(shape)], 1)
-    opacity = (state.opacity * (1 + state.opacity_spread * normal[:, 2])).clamp(0.05, 0.98)
+    opacity = ((state.opacity or 0.0) * (1 + state.opacity_spread * normal[:, 2])).clamp(0.05, 0.98)
     tone = (1 - state.tone_spread * normal[:, 3].abs()).clamp(0.80, 1.0)
     tint = 1 + 0.012 * normal[:, 4:5] * torch.tensor([-1.0, 0.0, 1.0])  # bluish or warmish by a hair
     rgb = (torch.tensor(state.rgb) * tone[:, None] * tint).clamp(0.0, 1.0)

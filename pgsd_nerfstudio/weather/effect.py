@@ -9,37 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-
-@dataclass(frozen=True, kw_only=True)
-class Emission:
-    """How much falls, and in which sizes."""
-
-    intensity: float
-    """Precipitation rate in mm/h of liquid water (light snow < 1, moderate 1-2.5, heavy > 2.5)."""
-    smallest: float = 0.001
-    """Smallest diameter that is simulated, in metres; what is smaller carries little water and is not seen."""
-    largest: float = 0.012
-    """Largest diameter, in metres; the fits of fall speed and mass end there."""
-    importance: float = 1.5
-    """Where not every real particle can be simulated, larger ones are preferred: chance ~ diameter ** importance."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.intensity <= 100.0:
-            raise ValueError(f"intensity must lie in 0-100 mm/h of water, got {self.intensity:g}; heavy snow is about 3")
-        if not 0.0 < self.smallest < self.largest:
-            raise ValueError(f"diameters must satisfy 0 < smallest < largest, got {self.smallest:g} and {self.largest:g} m")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Material:
-    """Mass and fall speed as power laws of the diameter in millimetres."""
-
-    mass_milligram: float
-    """Mass of a particle of 1 mm diameter, in milligrams."""
-    mass_exponent: float
-    speed_at_1mm: float
-    """Terminal speed of a particle of 1 mm diameter, in m/s."""
-    speed_exponent: float
+from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
+from pgsd_nerfstudio.weather.touch import SurfaceResponse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,20 +40,9 @@ class Wind:
     """Sideways speed of the swaying that each flake does on its own, in m/s."""
     flutter_hertz: float = 1.6
     """Typical rate of that swaying."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceResponse:
-    """What happens on contact."""
-
-    holds_degrees: float = 50.0
-    """Up to this slope every particle stays."""
-    slips_degrees: float = 80.0
-    """From this slope none stays; in between the chance falls linearly."""
-    settle: float = 0.006
-    """Height at which a landed particle rests above the surface, so that it is not drawn into it."""
-    probe: float = 0.12
-    """Largest radius over which a landed particle may spread; less where the surface ends or bends before."""
+    diffusivity: float = 0.0
+    """Eddy diffusivity in m^2/s of the turbulence below `smallest_eddy`: what is carried by it walks at random, sqrt(2 K t)
+    along each axis. For fog; what falls hardly feels it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +54,8 @@ class StateLook:
     scale_per_diameter: tuple[float, float, float] = (0.30, 0.24, 0.14)
     """In the air, where `scale_m` is None."""
     scale_spread: float = 0.15
-    opacity: float = 0.85
+    opacity: float | None = 0.85
+    """None: from the extinction of the droplets that a particle stands for, so that many of them obey Beer-Lambert."""
     opacity_spread: float = 0.10
     rgb: tuple[float, float, float] = (0.95, 0.97, 1.0)
     tone_spread: float = 0.04
@@ -112,14 +73,6 @@ class Appearance:
     exposure: float = 0.0
     """How long the shutter is open, in seconds: what flies is smeared along its way by speed times exposure. 0 freezes it, as
     snow is mostly shown; rain and sand show streaks at 1/50 s."""
-    accumulation_speedup: float = 800.0
-    """Time lapse of the cover: a landed particle stands for this many times the water that it and the real particles it
-    represents bring. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours."""
-    layer_density: float = 100.0
-    """Density of the fresh layer in kg/m^3; 100 makes 1 cm of snow from 1 mm of water."""
-    layer_thickness: float = 0.010
-    """Thickness in metres of what one particle leaves; its area follows from its volume, so that the cover does not depend on
-    how many particles were affordable."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.exposure <= 1.0:
@@ -135,6 +88,8 @@ class Effect:
     material: Material
     wind: Wind = field(default_factory=Wind)
     surface: SurfaceResponse = field(default_factory=SurfaceResponse)
+    dense: Dense | None = None
+    """What it is where much of it moves together on a surface; None: particles never feel each other."""
     appearance: Appearance = field(default_factory=Appearance)
     prompt: str
     """What a video model is told; {scene} stands for the description of the scene."""
@@ -156,7 +111,7 @@ def register(new: Effect) -> Effect:
 
 
 def effect(name: str, *, intensity: float | None = None, exposure: float | None = None) -> Effect:
-    """The effect of that name, with another intensity (mm/h of water) or shutter time (seconds) if given.
+    """The effect of that name, with another intensity (in the effect's own unit) or shutter time (seconds) if given.
 
     Raises:
         ValueError: there is none, then the message names the known ones; or a number is out of its range.

@@ -14,16 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from pgsd_nerfstudio.weather.effect import (
-    Appearance,
-    Effect,
-    Emission,
-    Material,
-    StateLook,
-    SurfaceResponse,
-    Wind,
-    register,
-)
+from pgsd_nerfstudio.weather.effect import Appearance, Effect, StateLook, Wind, register
+from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
+from pgsd_nerfstudio.weather.touch import SurfaceResponse
 
 AGGREGATES = Material(mass_milligram=0.073, mass_exponent=1.4, speed_at_1mm=0.8, speed_exponent=0.16)
 
@@ -34,6 +27,7 @@ SNOWFALL = register(
         material=AGGREGATES,
         wind=Wind(),
         surface=SurfaceResponse(),
+        dense=Dense(matter="snow"),
         appearance=Appearance(
             active=StateLook(scale_per_diameter=(0.34, 0.28, 0.16), scale_spread=0.2, opacity=0.8, opacity_spread=0.18),
             collided=StateLook(
@@ -52,13 +46,13 @@ SNOWFALL = register(
 
 
 def fall_speed(diameter: Float[ndarray, "n"], material: Material = AGGREGATES) -> Float[ndarray, "n"]:
-    """Terminal speed in m/s of particles with `diameter` in metres."""
+    """Terminal speed in m/s of particles with `diameter` in metres, whose law is a power."""
     return material.speed_at_1mm * (1e3 * diameter) ** material.speed_exponent
 
 
 def mass(diameter: Float[ndarray, "n"], material: Material = AGGREGATES) -> Float[ndarray, "n"]:
     """Mass in kg of particles with `diameter` in metres."""
-    return 1e-6 * material.mass_milligram * (1e3 * diameter) ** material.mass_exponent
+    return material.mass(diameter)
 
 
 def number_density(melted: Float[ndarray, "n"], intensity: float) -> Float[ndarray, "n"]:

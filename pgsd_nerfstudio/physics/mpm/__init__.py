@@ -9,7 +9,8 @@ from pgsd_nerfstudio.physics.mpm.layout import ACTIVE, REMOVED, RESTING
 from pgsd_nerfstudio.physics.mpm.materials import Elastic, Matter, Sand, Snow, Water
 from pgsd_nerfstudio.physics.mpm.obstacle import Obstacle
 from pgsd_nerfstudio.physics.mpm.report import Report
-from pgsd_nerfstudio.physics.mpm.solver import Mpm, Unstable
+from pgsd_nerfstudio.physics.mpm.solver import Mpm
+from pgsd_nerfstudio.physics.mpm.stability import Unstable
 
 __all__ = [
     "ACTIVE",

@@ -1,62 +1,66 @@
 """Which blocks of the grid exist now, and which particles lie in which.
 
-A block owns the particles whose lowest node lies in it; their stencils reach into the next block on each axis at most. So
-blocks of one colour (parity on three axes: eight colours) never write to the same node, and a pass per colour needs no
-atomics. On the CPU particles are counted into blocks by one thread, stably: the same input gives the same sums, bit for bit.
+A block owns the particles whose lowest node lies in it; their stencils reach two nodes into the next block on each axis. The
+particles of a block add to a patch of 6 x 6 x 6 nodes of their own (its halo), and each node then takes its sum from the
+patches that cover it: no atomics, and the same input gives the same sums, bit for bit, on any number of threads.
 """
 
-from dataclasses import dataclass
+# What Taichi compiles is not what Python would run, which is all that a type checker can see.
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportGeneralTypeIssues=false
+
+from typing import Any
 
 import taichi as ti
 import torch
-from torch import Tensor
 
-from pgsd_nerfstudio.physics.mpm.layout import ACTIVE, BLOCK, CELLS, NODE, STATE, Array1, Array2, X, base_node, block_of, read3
+from pgsd_nerfstudio.physics.mpm.layout import (
+    ACTIVE,
+    BLOCK,
+    CELLS,
+    HALO,
+    NODE,
+    STATE,
+    Array1,
+    Array2,
+    Rows,
+    Tags,
+    X,
+    base_node,
+    block_at,
+    block_of,
+    read3,
+)
 
-COUNT, BEGIN, MARK = 0, 1, 2  # columns per block: particles, where they begin in the order, whether it is touched
-OCCUPIED, QUEUE, TOUCHED = 0, 1, 2  # columns of the lists: blocks with particles, the same by colour, blocks within reach
-COLOURS = 8
-N_TOUCHED, N_OCCUPIED, N_PARTICLES = 9, 10, 11  # in heads, after the beginnings of the colours in the queue
-HEADS = 12
+# Columns per block: particles, where they begin in the order, the number of its halo, whether it is touched, to be woken.
+COUNT, BEGIN, SLOT, MARK, WAKES = 0, 1, 2, 3, 4
+OCCUPIED, TOUCHED = 0, 1  # columns of the lists: blocks with particles, blocks within their reach
+N_OCCUPIED, N_TOUCHED, N_PARTICLES, N_WAKING = 0, 1, 2, 3  # in heads; the last is 0 or 1
+HEADS = 4
 
 
-@dataclass(frozen=True)
 class Blocks:
     """Tables of the blocks of a grid of bx x by x bz blocks."""
 
-    shape: tuple[int, int, int]
-    table: Tensor  # int32 [blocks, 3]
-    lists: Tensor  # int32 [blocks, 3]
-    heads: Tensor  # int32 [HEADS]
-
-    @staticmethod
-    def of(shape: tuple[int, int, int], device: str) -> "Blocks":
+    def __init__(self, shape: tuple[int, int, int], dtype: torch.dtype, device: str) -> None:
         count = shape[0] * shape[1] * shape[2]
-        ints = {"dtype": torch.int32, "device": device}
-        return Blocks(shape, torch.zeros(count, 3, **ints), torch.zeros(count, 3, **ints), torch.zeros(HEADS, **ints))
+        ints: dict[str, Any] = {"dtype": torch.int32, "device": device}
+        self.shape = shape
+        self.table = torch.zeros(count, 5, **ints)
+        self.lists = torch.zeros(count, 2, **ints)
+        self.heads = torch.zeros(HEADS, **ints)
+        self.halo = torch.zeros(0, NODE, dtype=dtype, device=device)
 
-
-@ti.func
-def colour_of(block, by, bz):
-    return ((block // (by * bz)) & 1) * 4 + (((block // bz) % by) & 1) * 2 + ((block % bz) & 1)
-
-
-@ti.kernel
-def clear(grid: Array2, table: Array2, lists: Array2, heads: Array1):
-    """Empty what was touched before."""
-    for t in range(heads[N_TOUCHED] * CELLS):
-        block = lists[t // CELLS, TOUCHED]
-        for i in ti.static(range(NODE)):
-            grid[block * CELLS + t % CELLS, i] = 0.0
-        if t % CELLS == 0:
-            table[block, COUNT] = 0
-            table[block, MARK] = 0
+    def make_room(self) -> None:
+        """Halos for all occupied blocks."""
+        needed = int(self.heads[N_OCCUPIED]) * HALO
+        if needed > len(self.halo):
+            self.halo = self.halo.new_zeros(needed + needed // 2, NODE)
 
 
 @ti.kernel
 def sort(
-    state: Array2,
-    tags: Array2,
+    state: Rows,
+    tags: Tags,
     listed: Array1,
     order: Array1,
     table: Array2,
@@ -68,41 +72,35 @@ def sort(
     by: int,
     bz: int,
 ):
-    """Order the listed particles by block and colour, and list the touched blocks; one thread."""
+    """Order the listed particles by block, stably, and list the blocks that they are in and that they touch."""
+    for a in range(count):
+        p = listed[a]
+        block = -1
+        if tags[p][STATE] == ACTIVE:
+            block = block_of(base_node(read3(state, p, X), inv_dx), by, bz)
+        tags[p][BLOCK] = block
     ti.loop_config(serialize=True)
     for _ in range(1):
-        occupied = 0
-        for h in range(COLOURS + 1):
-            heads[h] = 0
+        for t in range(heads[N_TOUCHED]):
+            table[lists[t, TOUCHED], COUNT] = 0
+            table[lists[t, TOUCHED], MARK] = 0
+        occupied, touched, begin = 0, 0, 0
         for a in range(count):
-            p = listed[a]
-            if tags[p, STATE] == ACTIVE:
-                block = block_of(base_node(read3(state, p, X), inv_dx), by, bz)
-                tags[p, BLOCK] = block
+            block = tags[listed[a]][BLOCK]
+            if block >= 0:
                 if table[block, COUNT] == 0:
                     lists[occupied, OCCUPIED] = block
-                    heads[colour_of(block, by, bz) + 1] += 1
+                    table[block, SLOT] = occupied
                     occupied += 1
                 table[block, COUNT] += 1
-        for h in range(COLOURS):
-            heads[h + 1] += heads[h]
-        # Place blocks by colour; heads[colour] runs to the end of its colour and is set back afterwards.
         for o in range(occupied):
             block = lists[o, OCCUPIED]
-            colour = colour_of(block, by, bz)
-            lists[heads[colour], QUEUE] = block
-            heads[colour] += 1
-        for h in range(COLOURS):
-            heads[COLOURS - h] = heads[COLOURS - h - 1]
-        heads[0] = 0
-        begin, touched = 0, 0
-        for o in range(occupied):
-            block = lists[o, QUEUE]
             table[block, BEGIN] = begin
             begin += table[block, COUNT]
             table[block, COUNT] = 0
+            at = block_at(block, by, bz)
             for q in range(8):
-                i, j, k = block // (by * bz) + q // 4, (block // bz) % by + (q // 2) % 2, block % bz + q % 2
+                i, j, k = at[0] + q // 4, at[1] + (q // 2) % 2, at[2] + q % 2
                 if i < bx and j < by and k < bz:
                     near = (i * by + j) * bz + k
                     if table[near, MARK] == 0:
@@ -110,41 +108,26 @@ def sort(
                         lists[touched, TOUCHED] = near
                         touched += 1
         for a in range(count):
-            p = listed[a]
-            if tags[p, STATE] == ACTIVE:
-                block = tags[p, BLOCK]
-                order[table[block, BEGIN] + table[block, COUNT]] = p
+            block = tags[listed[a]][BLOCK]
+            if block >= 0:
+                order[table[block, BEGIN] + table[block, COUNT]] = listed[a]
                 table[block, COUNT] += 1
-        heads[N_TOUCHED] = touched
         heads[N_OCCUPIED] = occupied
+        heads[N_TOUCHED] = touched
         heads[N_PARTICLES] = begin
 
 
-@ti.kernel
-def touch(
-    state: Array2,
-    tags: Array2,
-    listed: Array1,
-    order: Array1,
-    table: Array2,
-    lists: Array2,
-    heads: Array1,
-    count: int,
-    inv_dx: float,
-    by: int,
-    bz: int,
-):
-    """List the touched blocks, in parallel and without an order: for the GPU, whose scattering is atomic."""
-    for _ in range(1):
-        heads[N_TOUCHED] = 0
-        heads[N_PARTICLES] = count
-    for a in range(count):
-        p = listed[a]
-        order[a] = p
-        if tags[p, STATE] == ACTIVE:
-            base = base_node(read3(state, p, X), inv_dx)
-            for q in range(8):
-                corner = base + 2 * ti.Vector([q // 4, (q // 2) % 2, q % 2])
-                near = block_of(corner, by, bz)
-                if ti.atomic_max(table[near, MARK], 1) == 0:
-                    lists[ti.atomic_add(heads[N_TOUCHED], 1), TOUCHED] = near
+@ti.func
+def touch(block, table: ti.template(), lists: ti.template(), heads: ti.template()):
+    """List a block that particles reach, in parallel and without an order."""
+    if ti.atomic_max(table[block, MARK], 1) == 0:
+        lists[ti.atomic_add(heads[N_TOUCHED], 1), TOUCHED] = block
+
+
+@ti.func
+def first_cell(t):
+    """Whether t is the first number of a block's CELLS.
+
+    Taichi gives a thread 512 turns of a loop at least, so a loop over blocks counts cells and does a block at its first.
+    """
+    return t % CELLS == 0

@@ -15,10 +15,17 @@ class Sleep:
     """Speed in m/s below which a particle may fall asleep."""
     frames: int = 5
     """Consecutive steps during which it must be that slow and lie on an obstacle or on resting matter."""
+    wake_speed: float = 0.2
+    """Speed in m/s from which resting matter wakes: that which it and what comes upon it would have together, did they not
+    part. Fresh snow at 1 m/s does not wake what it falls on, a snowball does. Infinity: it only wakes when told to."""
 
     def __post_init__(self) -> None:
         if not self.speed >= 0 or self.frames < 1:
             raise ValueError(f"sleep needs a speed >= 0 and at least one frame, got {self.speed:g} m/s and {self.frames}")
+        if not self.wake_speed > self.speed:
+            raise ValueError(
+                f"what wakes matter must be faster than what may fall asleep, got {self.wake_speed:g} and {self.speed:g} m/s"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +43,7 @@ class MpmConfig:
     max_substeps: int = 5000
     """Substeps that one step may need before it is refused."""
     max_cells: int = 50_000_000
-    """Grid nodes that may be allocated; each takes 16 bytes (f32), and 20 for each part of the obstacle. What no particle comes
+    """Grid nodes that may be allocated; each takes 16 bytes (f32), and 24 for each part of the obstacle. What no particle comes
     near is never touched, but the obstacle is."""
     sleep: Sleep | None = None
     """When particles come to rest and no longer cost time; None: never."""

@@ -4,8 +4,12 @@ The singular values of F come from Jacobi rotations of F^T F, which is ten times
 is Kirchhoff's (tau = P F^T), diagonal in the left singular vectors.
 """
 
+# What Taichi compiles is not what Python would run, which is all that a type checker can see.
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportGeneralTypeIssues=false
+
 import taichi as ti
 
+from pgsd_nerfstudio.physics.mpm import nearly_rigid as nr
 from pgsd_nerfstudio.physics.mpm.layout import (
     ACTIVE,
     ENERGY,
@@ -18,6 +22,8 @@ from pgsd_nerfstudio.physics.mpm.layout import (
     C,
     F,
     J,
+    Rows,
+    Tags,
     V,
     read3,
     read33,
@@ -134,8 +140,14 @@ def water_answer(ratio, bulk):
 
 
 @ti.func
+def beyond_cone(trace, size, mu, lam, friction):
+    """By how much a deviatoric Hencky strain of norm `size` exceeds what the Drucker-Prager cone allows."""
+    return size + (3.0 * lam + 2.0 * mu) / (2.0 * mu) * trace * friction
+
+
+@ti.func
 def sand_return(strain, correction, mu, lam, friction, most):
-    """Hencky strain brought back onto the Drucker-Prager cone, and the volume correction that is left."""
+    """Principal Hencky strains brought back onto the Drucker-Prager cone, and the volume correction that is left."""
     shifted = strain + correction / 3.0
     trace = shifted.sum()
     left = 0.0
@@ -145,62 +157,148 @@ def sand_return(strain, correction, mu, lam, friction, most):
     else:
         deviator = shifted - trace / 3.0
         size = deviator.norm()
-        beyond = size + (3.0 * lam + 2.0 * mu) / (2.0 * mu) * trace * friction
+        beyond = beyond_cone(trace, size, mu, lam, friction)
         back = shifted
         if beyond > 0.0:
             back = shifted - deviator * (beyond / size)
     return back, left
 
 
+@ti.func
+def sand_nearly_rigid(extra, f, correction, mu, lam, friction, most):
+    """`sand_return` without principal axes: stress, energy density, F and the volume correction that is left."""
+    strain = nr.logarithm(extra)
+    change = -strain
+    trace = nr.trace(strain) + correction
+    left = 0.0
+    stress, energy = change * 0.0, 0.0
+    if trace >= 0.0:
+        left = ti.min(trace, most)
+    else:
+        change *= 0.0
+        for d in ti.static(nr.DIAGONAL):
+            change[d] = correction / 3.0
+        deviator = strain
+        for d in ti.static(nr.DIAGONAL):
+            deviator[d] -= nr.trace(strain) / 3.0
+        size = ti.sqrt(nr.norm_sqr(deviator))
+        beyond = beyond_cone(trace, size, mu, lam, friction)
+        if beyond > 0.0:
+            change -= deviator * (beyond / size)
+        strain += change
+        stress = 2.0 * mu * strain
+        for d in ti.static(nr.DIAGONAL):
+            stress[d] += lam * trace
+        energy = mu * nr.norm_sqr(strain) + 0.5 * lam * trace**2
+    return stress, energy, nr.applied(nr.exponential(change), f), left
+
+
+@ti.func
+def corotated_nearly_rigid(extra, high, volume, mu, lam):
+    """`corotated` without principal axes, of matter that does not yield: stress, energy density and tangent stiffness."""
+    strain = nr.root(extra)
+    stress = 2.0 * mu * (extra - strain)
+    for d in ti.static(nr.DIAGONAL):
+        stress[d] += lam * (volume - 1.0) * volume
+    energy = mu * nr.norm_sqr(strain) + 0.5 * lam * (volume - 1.0) ** 2
+    return stress, energy, 2.0 * mu * stiffening(ti.sqrt(1.0 + high)) + 3.0 * lam * stiffening(volume)
+
+
+@ti.func
+def is_nearly_rigid(table: ti.template(), m, kind, extra, f, ratio):
+    """Whether the series hold, and snow certainly does not yield."""
+    low, high = nr.discs(extra)
+    least, most = -nr.SMALL, nr.SMALL
+    if kind == SNOW:
+        least = ti.max(least, table[m, COMPRESSION] ** 2 - 1.0)
+        most = ti.min(most, table[m, STRETCH] ** 2 - 1.0)
+    elif kind == SAND and ratio > 3.0 * nr.SMALL:
+        most = -1.0
+    return f.determinant() > 0.0 and low >= least and high <= most
+
+
+@ti.func
+def answer_nearly_rigid(table: ti.template(), m, kind, extra, f_, ratio_):
+    """Stress (six numbers), energy density, tangent stiffness, and F and ratio that are left; without principal axes."""
+    mu, lam, f, ratio = table[m, MU], table[m, LAMBDA], f_, ratio_
+    tau, energy, stiffness = extra * 0.0, 0.0, 2.0 * mu + 3.0 * lam
+    if kind == SAND:
+        a, b, c, d = sand_nearly_rigid(extra, f, ratio, mu, lam, table[m, FRICTION], table[m, HIGH])
+        tau, energy, f, ratio = a, b, c, d
+    else:
+        harder = 1.0
+        if kind == SNOW:
+            harder = ti.exp(table[m, HARDENING] * (1.0 - ratio))
+        _, high = nr.discs(extra)
+        a, b, c = corotated_nearly_rigid(extra, high, f.determinant(), harder * mu, harder * lam)
+        tau, energy, stiffness = a, b, c
+    return tau, energy, stiffness, f, ratio
+
+
+@ti.func
+def answer_in_general(table: ti.template(), m, kind, f_, ratio_):
+    """The same of any deformation, by its principal axes."""
+    mu, lam, f, ratio = table[m, MU], table[m, LAMBDA], f_, ratio_
+    u, values, v = singular_values(f)
+    stress, energy, stiffness = ti.Vector.zero(float, 3), 0.0, 2.0 * mu + 3.0 * lam
+    if kind == SAND:
+        strain = ti.log(ti.max(ti.abs(values), 1e-4))
+        strain, ratio = sand_return(strain, ratio, mu, lam, table[m, FRICTION], table[m, HIGH])
+        f = assembled(u, ti.exp(strain), v)
+        stress = 2.0 * mu * strain + lam * strain.sum()
+        energy = mu * strain.norm_sqr() + 0.5 * lam * strain.sum() ** 2
+    else:
+        harder = 1.0
+        if kind == SNOW:
+            kept = ti.min(ti.max(values, table[m, COMPRESSION]), table[m, STRETCH])
+            flow = ti.abs(values[0] * values[1] * values[2]) / (kept[0] * kept[1] * kept[2])
+            ratio = ti.min(ti.max(ratio * flow, table[m, LOW]), table[m, HIGH])
+            harder = ti.exp(table[m, HARDENING] * (1.0 - ratio))
+            values = kept
+            f = assembled(u, values, v)
+        a, b, c = corotated(values, harder * mu, harder * lam)
+        stress, energy, stiffness = a, b, c
+    tau = assembled(u, stress, u)
+    return nr.six(tau), energy, stiffness, f, ratio
+
+
+@ti.func
+def deform(state: ti.template(), signal: ti.template(), table: ti.template(), p, m, gradient, dt):
+    """Deform a particle of material m by a velocity gradient; writes F, J, stress, energy and the speed of signals in m/s."""
+    kind = ti.cast(table[m, KIND], ti.i32)
+    volume, ratio = state[p][VOLUME], state[p][J]
+    stiffness, energy = 0.0, 0.0
+    tau = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    if kind == WATER:
+        ratio = ti.min(ti.max(ratio * ti.exp(dt * gradient.trace()), table[m, LOW]), table[m, HIGH])
+        pressure, a, b = water_answer(ratio, table[m, LAMBDA])
+        energy, stiffness = a, b
+        for d in ti.static(nr.DIAGONAL):
+            tau[d] = pressure
+    else:
+        f = read33(state, p, F)
+        f += dt * gradient @ f
+        extra = nr.excess(f)
+        if is_nearly_rigid(table, m, kind, extra, f, ratio):
+            a, b, c, d, e = answer_nearly_rigid(table, m, kind, extra, f, ratio)
+            tau, energy, stiffness, f, ratio = a, b, c, d, e
+        else:
+            a, b, c, d, e = answer_in_general(table, m, kind, f, ratio)
+            tau, energy, stiffness, f, ratio = a, b, c, d, e
+        write33(state, p, F, f)
+    for k in ti.static(range(6)):
+        state[p][TAU + k] = tau[k] * volume
+    state[p][J] = ratio
+    state[p][ENERGY] = energy * volume
+    signal[p] = ti.sqrt(stiffness / table[m, DENSITY]) + read3(state, p, V).norm()
+
+
 @ti.kernel
-def respond(state: Array2, tags: Array2, signal: Array1, table: Array2, order: Array1, count: int, dt: float):
-    """Deform every active particle by its velocity gradient; writes F, J, stress, energy and the speed of signals in m/s."""
+def respond(state: Rows, tags: Tags, signal: Array1, table: Array2, which: Array1, count: int, dt: float):
+    """Stress, energy and signals of particles after they were deformed for dt seconds."""
     for a in range(count):
-        p = order[a]
-        if tags[p, STATE] == ACTIVE:
-            m = tags[p, MATERIAL]
-            kind = ti.cast(table[m, KIND], ti.i32)
-            mu, lam = table[m, MU], table[m, LAMBDA]
-            gradient = read33(state, p, C)
-            volume = state[p, VOLUME]
-            stiffness, energy = 0.0, 0.0
-            tau = ti.Matrix.identity(float, 3)
-            if kind == WATER:
-                ratio = state[p, J] * ti.exp(dt * gradient.trace())
-                ratio = ti.min(ti.max(ratio, table[m, LOW]), table[m, HIGH])
-                state[p, J] = ratio
-                pressure, energy_, stiffness_ = water_answer(ratio, lam)
-                energy, stiffness = energy_, stiffness_
-                tau = tau * pressure
-            else:
-                f = read33(state, p, F)
-                f += dt * gradient @ f
-                u, values, v = singular_values(f)
-                stress = ti.Vector.zero(float, 3)
-                if kind == SAND:
-                    strain = ti.log(ti.max(ti.abs(values), 1e-4))
-                    strain, left = sand_return(strain, state[p, J], mu, lam, table[m, FRICTION], table[m, HIGH])
-                    state[p, J] = left
-                    f = assembled(u, ti.exp(strain), v)
-                    stress = 2.0 * mu * strain + lam * strain.sum()
-                    energy = mu * strain.norm_sqr() + 0.5 * lam * strain.sum() ** 2
-                    stiffness = 2.0 * mu + 3.0 * lam
-                else:
-                    harder = 1.0
-                    if kind == SNOW:
-                        kept = ti.min(ti.max(values, table[m, COMPRESSION]), table[m, STRETCH])
-                        flow = ti.abs(values[0] * values[1] * values[2]) / (kept[0] * kept[1] * kept[2])
-                        plastic = ti.min(ti.max(state[p, J] * flow, table[m, LOW]), table[m, HIGH])
-                        state[p, J] = plastic
-                        harder = ti.exp(table[m, HARDENING] * (1.0 - plastic))
-                        values = kept
-                        f = assembled(u, values, v)
-                    stress_, energy_, stiffness_ = corotated(values, harder * mu, harder * lam)
-                    stress, energy, stiffness = stress_, energy_, stiffness_
-                write33(state, p, F, f)
-                tau = assembled(u, stress, u)
-            write33(state, p, TAU, tau * volume)
-            state[p, ENERGY] = energy * volume
-            signal[p] = ti.sqrt(stiffness / table[m, DENSITY]) + read3(state, p, V).norm()
+        p = which[a]
+        if tags[p][STATE] == ACTIVE:
+            deform(state, signal, table, p, tags[p][MATERIAL], read33(state, p, C), dt)
         else:
             signal[p] = 0.0

@@ -4,13 +4,16 @@ Nodes: Coulomb friction on the relative velocity, separation is free. Particles:
 the surface, so that nothing passes a plate, however fast.
 """
 
+# What Taichi compiles is not what Python would run, which is all that a type checker can see.
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportGeneralTypeIssues=false
+
 import taichi as ti
 
-from pgsd_nerfstudio.physics.mpm.blocks import N_TOUCHED, TOUCHED
 from pgsd_nerfstudio.physics.mpm.layout import (
     ACTIVE,
-    CELLS,
+    BLOCK,
     MARGIN,
+    MASS,
     QUIET,
     RESTING,
     STATE,
@@ -19,12 +22,14 @@ from pgsd_nerfstudio.physics.mpm.layout import (
     WALL,
     Array1,
     Array2,
+    Rows,
+    Tags,
     V,
     X,
     axis_terms,
     base_node,
+    block_of,
     read3,
-    write3,
 )
 
 HELD = 0.5  # share of a node's volume that rests, from which the node counts as solid
@@ -55,11 +60,27 @@ def trilinear(rows: ti.template(), position, column, inv_dx, by, bz):
     part = at - cell
     terms = axis_terms(cell + MARGIN, by, bz)
     total = 0.0
-    for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
-        w = (part[0] if ti.static(i == 1) else 1.0 - part[0]) * (part[1] if ti.static(j == 1) else 1.0 - part[1])
-        w *= part[2] if ti.static(k == 1) else 1.0 - part[2]
+    for q in range(8):
+        i, j, k = q // 4, (q // 2) % 2, q % 2
+        w = ti.abs(1.0 - i - part[0]) * ti.abs(1.0 - j - part[1]) * ti.abs(1.0 - k - part[2])
         total += w * rows[terms[0, i] + terms[1, j] + terms[2, k], column]
     return total
+
+
+@ti.func
+def wall_at(wall: ti.template(), first, position, inv_dx, by, bz):
+    """Distance, normal (of any length) and friction of a part of the obstacle, between nodes."""
+    at = position * inv_dx
+    cell = ti.cast(ti.floor(at), ti.i32)
+    part = at - cell
+    terms = axis_terms(cell + MARGIN, by, bz)
+    told = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
+    for q in range(8):
+        i, j, k = q // 4, (q // 2) % 2, q % 2
+        w = ti.abs(1.0 - i - part[0]) * ti.abs(1.0 - j - part[1]) * ti.abs(1.0 - k - part[2])
+        for c in ti.static(range(5)):
+            told[c] += w * wall[terms[0, i] + terms[1, j] + terms[2, k], first + c]
+    return told[0], ti.Vector([told[1], told[2], told[3]]), told[4]
 
 
 @ti.func
@@ -68,18 +89,14 @@ def pushed_out(wall: ti.template(), parts, position, velocity, inv_dx, by, bz, t
     x, v = position, velocity
     for part in range(parts):
         first = part * WALL
-        distance = 0.0
         if x.min() >= 0.0 and (top - x).min() >= 0.0:
-            distance = trilinear(wall, x, first, inv_dx, by, bz)
-        if distance < 0.0:
-            normal = ti.Vector.zero(float, 3)
-            for d in ti.static(range(3)):
-                normal[d] = trilinear(wall, x, first + 1 + d, inv_dx, by, bz)
-            size = normal.norm()
-            if size > 1e-3:
-                normal /= size
-                v = slid(v, normal, trilinear(wall, x, first + 4, inv_dx, by, bz))
-                x -= distance * normal
+            terms = axis_terms(ti.cast(ti.floor(x * inv_dx), ti.i32) + MARGIN, by, bz)
+            if wall[terms[0, 0] + terms[1, 0] + terms[2, 0], first + 5] < 0.0:
+                distance, normal, friction = wall_at(wall, first, x, inv_dx, by, bz)
+                size = normal.norm()
+                if distance < 0.0 and size > 1e-3:
+                    v = slid(v, normal / size, friction)
+                    x -= normal * (distance / size)
     return x, v
 
 
@@ -92,40 +109,29 @@ def nearest(wall: ti.template(), parts, position, inv_dx, by, bz):
     return least
 
 
-@ti.kernel
-def move_nodes(
-    grid: Array2,
-    wall: Array2,
-    rest: Array2,
-    lists: Array2,
-    heads: Array1,
-    parts: int,
-    resting: int,
-    dt: float,
-    gx: float,
-    gy: float,
-    gz: float,
-):
-    """Momentum to velocity, gravity, obstacles, resting matter."""
-    for t in range(heads[N_TOUCHED] * CELLS):
-        node = lists[t // CELLS, TOUCHED] * CELLS + t % CELLS
-        mass = grid[node, 0]
-        if mass > 0.0:
-            v = read3(grid, node, 1) / mass + dt * ti.Vector([gx, gy, gz])
-            for part in range(parts):
-                first = part * WALL
-                if wall[node, first] <= 0.0:
-                    normal = ti.Vector([wall[node, first + 1], wall[node, first + 2], wall[node, first + 3]])
-                    v = slid(v, normal, wall[node, first + 4])
-            if resting == 1 and rest[node, 0] >= HELD:
-                v = ti.Vector.zero(float, 3)
-            write3(grid, node, 1, v)
+@ti.func
+def moved(row, wall: ti.template(), rest: ti.template(), node, parts, resting, wake_speed, dt, gravity):
+    """Velocity of a node from its [mass, momentum], after gravity, obstacles and matter at rest; and whether that must wake."""
+    mass, wakes = row[0], 0
+    v = ti.Vector([row[1], row[2], row[3]]) / mass + dt * gravity
+    for part in range(parts):
+        first = part * WALL
+        if wall[node, first] <= 0.0:
+            normal = ti.Vector([wall[node, first + 1], wall[node, first + 2], wall[node, first + 3]])
+            v = slid(v, normal, wall[node, first + 4])
+    if resting == 1 and rest[node, 0] >= HELD:
+        # The speed that both would have together, did they not part. What wakes is met with its momentum, not held still.
+        if mass * v.norm() > wake_speed * (mass + rest[node, 1]):
+            wakes = 1
+        else:
+            v = ti.Vector.zero(float, 3)
+    return v, wakes
 
 
 @ti.kernel
 def fall_asleep(
-    state: Array2,
-    tags: Array2,
+    state: Rows,
+    tags: Tags,
     wall: Array2,
     rest: Array2,
     listed: Array1,
@@ -141,7 +147,7 @@ def fall_asleep(
     """Count the frames during which a particle was slow and lay on something; after enough of them it rests."""
     for a in range(count):
         p = listed[a]
-        if tags[p, STATE] == ACTIVE:
+        if tags[p][STATE] == ACTIVE:
             x = read3(state, p, X)
             lies = 0
             if nearest(wall, parts, x, 1.0 / dx, by, bz) < dx:
@@ -149,16 +155,20 @@ def fall_asleep(
             if resting == 1 and trilinear(rest, x, 0, 1.0 / dx, by, bz) > FELT:
                 lies = 1
             if lies == 1 and read3(state, p, V).norm() < slow:
-                tags[p, QUIET] += 1
-                if tags[p, QUIET] >= frames:
-                    tags[p, STATE] = RESTING
+                tags[p][QUIET] += 1
+                if tags[p][QUIET] >= frames:
+                    tags[p][STATE] = RESTING
+                    tags[p][BLOCK] = block_of(base_node(x, 1.0 / dx), by, bz)
             else:
-                tags[p, QUIET] = 0
+                tags[p][QUIET] = 0
 
 
 @ti.kernel
-def deposit(state: Array2, rest: Array2, which: Array1, count: int, inv_dx: float, by: int, bz: int):
-    """Add the volume of resting particles to the nodes, as a share of a cell; one thread, so that sums are repeatable."""
+def deposit(state: Rows, rest: Array2, which: Array1, count: int, sign: float, inv_dx: float, by: int, bz: int):
+    """Add the volume of particles to the nodes, as a share of a cell, and their mass; or take them away (sign -1).
+
+    One thread, so that sums are repeatable.
+    """
     ti.loop_config(serialize=True)
     for a in range(count):
         p = which[a]
@@ -166,11 +176,13 @@ def deposit(state: Array2, rest: Array2, which: Array1, count: int, inv_dx: floa
         base = base_node(x, inv_dx)
         offset = x * inv_dx - (base - MARGIN)
         terms = axis_terms(base, by, bz)
-        share = state[p, VOLUME] * inv_dx * inv_dx * inv_dx
+        share = state[p][VOLUME] * inv_dx * inv_dx * inv_dx
         for q in range(27):
             i, j, k = q // 9, (q // 3) % 3, q % 3
-            w = share * bump(offset[0] - i) * bump(offset[1] - j) * bump(offset[2] - k)
-            rest[terms[0, i] + terms[1, j] + terms[2, k], 0] += w
+            w = sign * bump(offset[0] - i) * bump(offset[1] - j) * bump(offset[2] - k)
+            node = terms[0, i] + terms[1, j] + terms[2, k]
+            rest[node, 0] += w * share
+            rest[node, 1] += w * state[p][MASS]
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""Experiments with a known end, which judge the solver: conservation, elasticity, water, friction.
+"""Experiments with a known end, which judge the solver: conservation, elasticity, friction.
 
 Each is a function of its resolution and returns what it measured beside what is known.
 """
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.mpm.config import MpmConfig
+from pgsd_nerfstudio.physics.mpm.config import MpmConfig, Sleep
 from pgsd_nerfstudio.physics.mpm.materials import Elastic, Sand, Snow, Water
 from pgsd_nerfstudio.physics.mpm.obstacle import Obstacle
 from pgsd_nerfstudio.physics.mpm.runtime import Precision
@@ -32,7 +32,8 @@ def lattice(lower: tuple[float, float, float], upper: tuple[float, float, float]
 
 def ball(centre: tuple[float, float, float], radius: float, spacing: float) -> tuple[Tensor, float]:
     """Points of a lattice within a ball, and the volume of each."""
-    low, high = (tuple(c + s * radius for c in centre) for s in (-1, 1))
+    x, y, z = centre
+    low, high = (x - radius, y - radius, z - radius), (x + radius, y + radius, z + radius)
     points, volume = lattice(low, high, spacing)
     return points[(points - points.new_tensor(centre)).norm(dim=1) <= radius], volume
 
@@ -85,31 +86,6 @@ def hydrostatic_column(cells: int = 20, precision: Precision = "f32", poisson: f
     return float(settled[top].mean()), float(analytic[top].mean())
 
 
-MARTIN_MOYCE = ((0.832, 1.217), (1.219, 1.474), (1.997, 2.292), (2.547, 2.995), (3.345, 4.134), (4.034, 4.944))
-"""Dimensionless time t sqrt(2 g / a) and front Z = x / a, for a column twice as high as wide (1952, table 2)."""
-
-
-def dam_break(
-    cells: int = 10, thick: int = 8, precision: Precision = "f32", bulk: float = 1e5
-) -> list[tuple[float, float, float]]:
-    """Time, front and measured front (Martin & Moyce) of a column of water of a = 2.25 inches, all dimensionless."""
-    a = 0.05715
-    dx = a / cells
-    walls = Obstacle.room((0, 0, 0), (7 * a, thick * dx, 4 * a), 0.0)
-    config = MpmConfig(dx=dx, precision=precision)
-    mpm = Mpm(config, Domain((-dx, -dx, -dx), (7 * a + dx, (thick + 1) * dx, 3 * a)), walls)
-    points, volume = lattice((0, 0, 0), (a, thick * dx, 2 * a), dx / 2)
-    mpm.emit(points, torch.zeros_like(points), Water(bulk_modulus=bulk), volume)
-    scale, fronts, now = math.sqrt(2 * G / a), [], 0.0
-    for late, far in MARTIN_MOYCE:
-        mpm.step((late - now) / scale)
-        now = late
-        # The front is where water is a particle deep: the farthest 0.2 %, splashes of single particles, are left out.
-        front = float(mpm.positions[:, 0].double().quantile(0.998)) + dx / 4
-        fronts.append((late, front / a, far))
-    return fronts
-
-
 def sliding_block(
     degrees: float = 30.0, friction: float = 0.3, cells: int = 4, precision: Precision = "f32"
 ) -> tuple[float, float]:
@@ -140,7 +116,8 @@ def colliding_balls(precision: Precision = "f32", cells: int = 8) -> tuple[float
     config = MpmConfig(dx=dx, gravity=(0, 0, 0), precision=precision)
     mpm = Mpm(config, Domain((0, 0, 0), (1.2, 1.2, 1.2)))
     for side in (-1.0, 1.0):
-        points, volume = ball((0.6 + side * 0.18,) * 3, radius, dx / 2)
+        at = 0.6 + side * 0.18
+        points, volume = ball((at, at, at), radius, dx / 2)
         mpm.emit(points, torch.full_like(points, -side * speed), Elastic(density=1000, youngs_modulus=1e3, poisson=0.3), volume)
     start = mpm.report()
     one = start.mass / 2 * speed
@@ -177,7 +154,7 @@ def free_cloud(precision: Precision = "f32", steps: int = 20) -> tuple[float, fl
 
 def spinning_ball(precision: Precision = "f32", turns: float = 1.0) -> tuple[float, float]:
     """An elastic ball that turns freely: relative change of angular momentum, and of kinetic energy."""
-    mpm = Mpm(MpmConfig(dx=0.05, gravity=(0, 0, 0), precision=precision), Domain((-0.5,) * 3, (0.5,) * 3))
+    mpm = Mpm(MpmConfig(dx=0.05, gravity=(0, 0, 0), precision=precision), Domain((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)))
     points, volume = ball((0, 0, 0), 0.25, 0.025)
     spin = torch.tensor([0.0, 0.0, 2 * math.pi], dtype=torch.float64).expand_as(points)
     mpm.emit(points, torch.linalg.cross(spin, points), Elastic(youngs_modulus=1e5), volume)
@@ -189,13 +166,46 @@ def spinning_ball(precision: Precision = "f32", turns: float = 1.0) -> tuple[flo
     return change, after.energy / before.energy - 1
 
 
-def dense_snow(count: int, precision: Precision = "f32", threads: int = 0) -> Mpm:
-    """A cube of snow of `count` particles, eight to a cell, that lies on a floor and leans against nothing."""
+def dense_snow(
+    count: int,
+    precision: Precision = "f32",
+    *,
+    threads: int = 0,
+    side: float = 1.0,
+    thrown: float = 0.0,
+    sleep: Sleep | None = None,
+) -> Mpm:
+    """A cube of snow of `count` particles, eight to a cell of 2 cm, that lies on a floor and leans against nothing.
+
+    Args:
+        side: half the width of the domain around it, in m.
+        thrown: speed in m/s with which it slides and presses down; what is thrown breaks and flows.
+    """
     dx = 0.02
     edge = (count / 8) ** (1 / 3) * dx
-    config = MpmConfig(dx=dx, precision=precision, threads=threads)
-    mpm = Mpm(config, Domain((-1, -1, 0), (1, 1, 1.5)), Obstacle.plane((0, 0, 0.1), (0, 0, 1)))
+    config = MpmConfig(dx=dx, precision=precision, threads=threads, sleep=sleep)
+    mpm = Mpm(config, Domain((-side, -side, 0), (side, side, 1.5)), Obstacle.plane((0, 0, 0.1), (0, 0, 1)))
     draw = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=draw, dtype=torch.float64) * edge + torch.tensor([-edge / 2, -edge / 2, 0.1])
-    mpm.emit(points, torch.zeros_like(points), Snow(), edge**3 / count)
+    mpm.emit(points, thrown * torch.tensor([1.0, 0.0, -1.0]).expand(count, 3), Snow(), edge**3 / count)
     return mpm
+
+
+def snow_layer(sleep: Sleep | None, edge: float = 1.0) -> Mpm:
+    """A square of loose snow, 20 cm high and `edge` metres long, between walls; it has had 0.6 s to come to rest."""
+    dx = 0.05
+    room = Obstacle.room((0, 0, 0), (edge, edge, 2), 0.5)
+    mpm = Mpm(MpmConfig(dx=dx, sleep=sleep), Domain((-dx, -dx, -dx), (edge + dx, edge + dx, 1)), room)
+    points, volume = lattice((0, 0, 0), (edge, edge, 0.2), dx / 2)
+    mpm.emit(points, torch.zeros_like(points), Snow(density=200), volume)
+    for _ in range(15):
+        mpm.step(0.04)
+    return mpm
+
+
+def throw_snowball(mpm: Mpm, speed: float = 5.0) -> None:
+    """A ball of denser snow just above the middle of a `snow_layer`, falling at `speed` m/s."""
+    x, y, _ = ((a + b) / 2 for a, b in zip(mpm.domain.lower, mpm.domain.upper, strict=True))
+    top = float(mpm.positions[:, 2].max())
+    points, volume = ball((x, y, top + 0.14), 0.12, mpm.config.dx / 2)
+    mpm.emit(points, torch.tensor([0.0, 0.0, -speed]).expand(len(points), 3), Snow(density=400), volume)

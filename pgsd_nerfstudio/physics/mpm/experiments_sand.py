@@ -72,7 +72,7 @@ def heap_slope(degrees: float = 30.0, cells: int = 8, start_degrees: float = 40.
     floor = Obstacle.plane((0, 0, 0), (0, 0, 1), STICKY)
     mirrors = Obstacle.plane((0, 0, 0), (1, 0, 0), 0.0) | Obstacle.plane((0, 0, 0), (0, 1, 0), 0.0)
     config = MpmConfig(dx=dx, precision=precision)
-    mpm = Mpm(config, Domain((-2 * dx,) * 3, (2 * radius, 2 * radius, height + 4 * dx)), mirrors | floor)
+    mpm = Mpm(config, Domain((-2 * dx, -2 * dx, -2 * dx), (2 * radius, 2 * radius, height + 4 * dx)), mirrors | floor)
     points, volume = lattice((0, 0, 0), (radius, radius, height), dx / 2)
     points = points[points[:, :2].norm(dim=1) / radius + points[:, 2] / height <= 1]
     mpm.emit(points, torch.zeros_like(points), Sand(friction_degrees=degrees, youngs_modulus=1e5), volume)

@@ -1,7 +1,8 @@
 """What matter meets: signed distance, outward normal and friction in space.
 
 Obstacles stand still and feel nothing. An obstacle has parts, which act one after the other: in the edge where floor and wall
-meet, matter may move into neither. A plate must be at least two grid cells thick, so that the two sides do not share nodes.
+meet, matter may move into neither. A plate must be at least two grid cells thick: the sides of a thinner one share nodes, or
+lie between them, and fast matter passes. What is known to be thinner is refused; `grown` makes it thicker.
 """
 
 from __future__ import annotations
@@ -21,31 +22,71 @@ Sampler = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
+class Part:
+    """One body of an obstacle."""
+
+    sample: Sampler
+    """Takes points [n, 3] in metres to distances [n] (negative inside), outward unit normals [n, 3] and frictions [n]."""
+    thickness: float = math.inf
+    """Of its thinnest plate, in metres, as far as that is known."""
+
+
+@dataclass(frozen=True)
 class Obstacle:
     """A solid body; made by `plane`, `box`, `room` or `from_grid`, and joined with `|`.
 
     Friction is Coulomb's coefficient; infinity sticks: what touches such a surface neither slides nor leaves.
     """
 
-    parts: tuple[Sampler, ...]
-    """Each takes points [n, 3] in metres to distances [n] (negative inside), outward unit normals [n, 3] and frictions [n]."""
+    parts: tuple[Part, ...]
 
     def __or__(self, other: Obstacle) -> Obstacle:
         return Obstacle(self.parts + other.parts)
 
     def distance(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance to the nearest part, in metres."""
-        return torch.stack([part(points)[0] for part in self.parts]).amin(0)
+        return torch.stack([part.sample(points)[0] for part in self.parts]).amin(0)
 
     def freed(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Points that lie inside, moved onto the surface."""
         for part in self.parts:
-            distance, normal, _ = part(points)
+            distance, normal, _ = part.sample(points)
             points = torch.where((distance < 0)[:, None], points - distance[:, None] * normal, points)
         return points
 
+    def grown(self, by: float) -> Obstacle:
+        """The obstacle with its surface moved outwards by `by` metres: sheets become plates twice as thick as that.
+
+        Raises:
+            ValueError: `by` is negative or not finite.
+        """
+        if not 0 <= by < math.inf:
+            raise ValueError(f"an obstacle grows by a finite length of 0 or more, got {by:g} m")
+
+        def larger(part: Part) -> Part:
+            def sample(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+                distance, normal, friction = part.sample(points)
+                return distance - by, normal, friction
+
+            return Part(sample, part.thickness + 2 * by)
+
+        return Obstacle(tuple(larger(part) for part in self.parts))
+
+    def require_thick(self, dx: float) -> None:
+        """Check that the sides of every plate lie apart on a grid.
+
+        Raises:
+            ValueError: a plate is thinner than two cells.
+        """
+        thinnest = min((part.thickness for part in self.parts), default=math.inf)
+        if thinnest < 2 * dx * (1 - 1e-6):
+            raise ValueError(
+                f"an obstacle must be two cells thick, here {2 * dx:g} m, or fast matter passes through it; its thinnest plate "
+                f"has {thinnest:g} m: use dx <= {thinnest / 2:g} m, or Obstacle.grown({dx - thinnest / 2:g})"
+            )
+
     def at_nodes(self, blocks: tuple[int, int, int], lower: Point, dx: float) -> Float[Tensor, "nodes columns"]:
-        """Distance, normal and friction of every part at the nodes of a grid of blocks, in the order of its rows."""
+        """What every part says at the nodes of a grid of blocks, in the order of its rows: the columns that `layout` names."""
         if not self.parts:
             return torch.zeros(1, WALL)
         _, by, bz = blocks
@@ -58,11 +99,13 @@ class Obstacle:
             node = node + torch.stack([cell // EDGE**2, cell // EDGE % EDGE, cell % EDGE], 1)
             points = torch.tensor(lower, dtype=torch.float64) + node.double() * dx
             for i, part in enumerate(self.parts):
-                distance, normal, friction = part(points)
+                distance, normal, friction = part.sample(points)
                 # A node on the surface counts as on it, whatever rounding says.
                 distance = torch.where(distance.abs() < 1e-6 * dx, 0.0, distance)
                 columns = [distance[:, None], normal, friction.clamp(max=STICKS)[:, None]]
-                wall[first : first + len(row), i * WALL : (i + 1) * WALL] = torch.cat(columns, 1)
+                wall[first : first + len(row), i * WALL : (i + 1) * WALL - 1] = torch.cat(columns, 1)
+        for i in range(len(self.parts)):
+            wall[:, (i + 1) * WALL - 1] = _least_in_cell(wall[:, i * WALL], blocks)
         return wall
 
     @staticmethod
@@ -90,7 +133,7 @@ class Obstacle:
             normal = torch.where((apart > 0)[:, None], outside / apart.clamp_min(1e-30)[:, None], face) * side
             return torch.where(apart > 0, apart, beyond.amax(1)), normal
 
-        return _uniform(distance, friction)
+        return _uniform(distance, friction, min(b - a for a, b in zip(lower, upper, strict=True)))
 
     @staticmethod
     def room(lower: Point, upper: Point, friction: float = 0.5) -> Obstacle:
@@ -114,8 +157,13 @@ class Obstacle:
         lower: Point,
         spacing: float,
         friction: float = 0.5,
+        thickness: float = math.inf,
     ) -> Obstacle:
         """Signed distance in metres and outward normals on a grid; node (0, 0, 0) lies at `lower`. Outside it nothing stands.
+
+        Args:
+            thickness: of the thinnest plate that must hold, in metres. It cannot be read off a grid, where every edge is thin.
+                A sheet whose distance is positive on both sides has 0, and holds nothing unless it is `grown`.
 
         Raises:
             ValueError: the arrays do not fit together or hold something that is not finite.
@@ -141,10 +189,19 @@ class Obstacle:
             away = torch.where(outside, values[:, 0].abs().clamp_min(spacing), values[:, 0])
             return away, torch.nn.functional.normalize(values[:, 1:], dim=1)
 
-        return _uniform(interpolated, friction)
+        return _uniform(interpolated, friction, thickness)
 
 
-def _uniform(distance: Callable[[Tensor], tuple[Tensor, Tensor]], friction: float) -> Obstacle:
+def _least_in_cell(distance: Float[Tensor, "nodes"], blocks: tuple[int, int, int]) -> Float[Tensor, "nodes"]:
+    """The least of a cell's eight nodes, at the lowest of them: where it is positive, no point of the cell lies inside."""
+    bx, by, bz = blocks
+    dense = distance.reshape(bx, by, bz, EDGE, EDGE, EDGE).permute(0, 3, 1, 4, 2, 5).reshape(bx * EDGE, by * EDGE, bz * EDGE)
+    beyond = torch.nn.functional.pad(dense[None, None], (0, 1, 0, 1, 0, 1), mode="replicate")
+    least = -torch.nn.functional.max_pool3d(-beyond, 2, stride=1)[0, 0]
+    return least.reshape(bx, EDGE, by, EDGE, bz, EDGE).permute(0, 2, 4, 1, 3, 5).reshape(-1)
+
+
+def _uniform(distance: Callable[[Tensor], tuple[Tensor, Tensor]], friction: float, thickness: float = math.inf) -> Obstacle:
     if not friction >= 0:
         raise ValueError(f"an obstacle's friction must not be negative, got {friction:g}")
 
@@ -152,4 +209,4 @@ def _uniform(distance: Callable[[Tensor], tuple[Tensor, Tensor]], friction: floa
         gap, normal = distance(points)
         return gap, normal, torch.full_like(gap, friction)
 
-    return Obstacle((sample,))
+    return Obstacle((Part(sample, thickness),))

@@ -25,7 +25,7 @@ from pgsd_nerfstudio.physics.mpm.layout import (
     V,
     X,
 )
-from pgsd_nerfstudio.physics.mpm.materials import SAND, WATER, Matter, kind_of
+from pgsd_nerfstudio.physics.mpm.materials import COLUMNS, SAND, WATER, Matter, kind_of
 
 QUANTITIES = {
     "position": slice(X, X + 3),
@@ -87,6 +87,17 @@ class Particles:
         ids = torch.arange(first, last)
         self.respond(ids)
         return ids
+
+    def restore(self, state: Tensor, tags: Tensor, signal: Tensor, materials: list[Matter]) -> None:
+        """Forget all particles and take these in their place."""
+        self.materials, self.count = list(materials), 0
+        self.table = torch.tensor([m.row() for m in materials], **self._real).reshape(-1, COLUMNS)
+        self._reserve(len(state))
+        self.count = len(state)
+        self.state[: self.count] = state.to(**self._real)
+        self.tags[: self.count] = tags.to(**self._int)
+        self.signal[: self.count] = signal.to(**self._real)
+        self.relist()
 
     def relist(self) -> None:
         """Note anew who is active."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from typing import Literal
+from typing import Any, Literal
 
 import taichi as ti
 import torch
@@ -32,7 +32,7 @@ def start(device: Device, precision: Precision, threads: int = 0) -> int:
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("MPM was asked to run on cuda, but torch finds no CUDA device; use device='cpu'")
     if _running != (device, precision, threads):
-        options = {"cpu_max_num_threads": threads} if threads else {}
+        options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
         with contextlib.redirect_stdout(io.StringIO()):  # Taichi says hello, whatever the log level
             ti.init(
                 arch=ti.cuda if device == "cuda" else ti.cpu,

@@ -11,24 +11,25 @@ fastest particle together travel `courant` cells at most, with the speed of soun
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.mpm import blocks, constitutive, contact, transfer
-from pgsd_nerfstudio.physics.mpm.config import MpmConfig, Sleep
-from pgsd_nerfstudio.physics.mpm.layout import ACTIVE, CELLS, MARGIN, MATERIAL, NODE, QUIET, RESTING, STATE, C, F, J, V, X
+from pgsd_nerfstudio.physics.mpm import blocks, constitutive, substep, transfer
+from pgsd_nerfstudio.physics.mpm.config import MpmConfig
+from pgsd_nerfstudio.physics.mpm.layout import CELLS, MARGIN, NODE, RESTING, STATE, F, J, V, X
 from pgsd_nerfstudio.physics.mpm.materials import Matter
 from pgsd_nerfstudio.physics.mpm.obstacle import Obstacle
 from pgsd_nerfstudio.physics.mpm.particles import Particles
 from pgsd_nerfstudio.physics.mpm.report import Report
+from pgsd_nerfstudio.physics.mpm.rest import Rest
 from pgsd_nerfstudio.physics.mpm.runtime import dtype_of, start, started
-
-
-class Unstable(RuntimeError):
-    """A step would need more substeps than allowed; the message names the cause."""
+from pgsd_nerfstudio.physics.mpm.snapshot import materials_as_tensor, materials_from, require_fitting
+from pgsd_nerfstudio.physics.mpm.stability import longest_substep, refusal
 
 
 class Mpm:
@@ -38,19 +39,20 @@ class Mpm:
         """Lay out the grid.
 
         Raises:
-            ValueError: the grid would have more than config.max_cells nodes.
+            ValueError: the grid would have more than config.max_cells nodes, or a plate is thinner than two cells.
         """
         self.config, self.domain, self.obstacle = config, domain, obstacle
         self.seconds, self.substeps = 0.0, 0
         _require_room(config, domain)
+        if obstacle is not None:
+            obstacle.require_thick(config.dx)
         self._start = start(config.device, config.precision, config.threads)
         real = {"dtype": dtype_of(config.precision), "device": config.device}
         self._particles = Particles(**real)
-        self._blocks = blocks.Blocks.of(transfer.grid_shape(domain.size, config.dx), config.device)
+        self._blocks = blocks.Blocks(transfer.grid_shape(domain.size, config.dx), **real)
         nodes = math.prod(self._blocks.shape) * CELLS
         self._grid = torch.zeros(nodes, NODE, **real)
-        self._rest = torch.zeros(nodes if config.sleep else 1, 1, **real)
-        self._resting = False
+        self._rest = Rest(config.sleep, self._blocks, config.dx, **real)
         self._atomic = config.device != "cpu"
         self._parts = len(obstacle.parts) if obstacle else 0
         self._wall = (obstacle or Obstacle(())).at_nodes(self._blocks.shape, domain.lower, config.dx).to(**real)
@@ -109,10 +111,10 @@ class Mpm:
             raise ValueError(f"a step takes a finite number of seconds >= 0, got {seconds:g}")
         done, left = 0, seconds
         while left > 0 and len(self._particles.active):
-            longest = self._longest_dt()
+            longest = longest_substep(self._particles, self.config, self.seconds)
             needed = max(1, math.ceil(left / longest * (1 - 1e-9)))
             if done + needed > self.config.max_substeps:
-                raise Unstable(self._cause(seconds, done + needed, longest))
+                raise refusal(self._particles, self.config, seconds, done + needed, longest)
             dt = left / needed
             self._substep(dt)
             done += 1
@@ -121,20 +123,48 @@ class Mpm:
             left = left - dt if needed > 1 else 0.0
         self.seconds += left
         self._particles.require_finite(self.seconds)
-        if self.config.sleep:
-            self._fall_asleep(self.config.sleep)
+        self._rest.settle(self._particles, self._wall, self._parts)
         self._particles.relist()
         return done
 
     def wake(self) -> None:
-        """Make all resting particles active again."""
-        tags = self._particles.tags[: len(self)]
-        tags[:, STATE][tags[:, STATE] == RESTING] = ACTIVE
-        tags[:, QUIET] = 0
-        self._rest.zero_()
-        self._resting = False
-        self._particles.relist()
-        self._particles.respond(self._particles.active)
+        """Make all resting particles active again. What is met fast enough (`Sleep.wake_speed`) wakes by itself."""
+        self._rest.wake(self._particles, torch.nonzero(self.states == RESTING)[:, 0])
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """All that the next step depends on, as copies on the CPU; `restore` takes it, in this or in another process."""
+        p = self._particles
+        return {
+            "state": p.state[: p.count].cpu().clone(),
+            "tags": p.tags[: p.count].cpu().clone(),
+            "signal": p.signal[: p.count].cpu().clone(),
+            "materials": materials_as_tensor(p.materials),
+            **self._rest.saved(),
+            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+            "substeps": torch.tensor(self.substeps),
+            "setting": self._setting,
+        }
+
+    def restore(self, snapshot: Mapping[str, Tensor]) -> None:
+        """Go on from a snapshot; what was simulated here before is forgotten. The steps that follow are bit for bit those that
+        would have followed there.
+
+        Raises:
+            ValueError: the snapshot was taken with another config, domain or obstacle, or is not one.
+        """
+        self._require_alive()
+        require_fitting(snapshot, self._setting, self._particles.state.dtype)
+        materials = materials_from(snapshot["materials"])
+        self._particles.restore(snapshot["state"], snapshot["tags"], snapshot["signal"], materials)
+        self._rest.restore(snapshot["rest_nodes"], snapshot["rest"], self._particles)
+        self.seconds, self.substeps = float(snapshot["seconds"]), int(snapshot["substeps"])
+
+    @cached_property
+    def _setting(self) -> Tensor:
+        """Numbers that differ where config, domain or obstacle do."""
+        c, d = self.config, self.domain
+        own = [c.dx, *d.lower, *d.upper, *c.gravity, float(c.sleep is not None), float(self._parts)]
+        return torch.cat([torch.tensor(own, dtype=torch.float64), self._wall.double().sum(0).cpu()])
 
     def __len__(self) -> int:
         return self._particles.count
@@ -181,68 +211,23 @@ class Mpm:
         return self._particles.state[: len(self), column : column + width].clone()
 
     def _substep(self, dt: float) -> None:
-        p, b, dx, (bx, by, bz) = self._particles, self._blocks, self.config.dx, self._blocks.shape
-        count = len(p.active)
-        blocks.clear(self._grid, b.table, b.lists, b.heads)
-        listing = (p.state, p.tags, p.active, p.order, b.table, b.lists, b.heads, count, 1 / dx)
-        if not self._atomic:
-            blocks.sort(*listing, bx, by, bz)
-            for colour in range(blocks.COLOURS):
-                transfer.scatter_colour(p.state, self._grid, p.order, b.table, b.lists, b.heads, colour, dt, dx, by, bz)
+        p, b, dx, count = self._particles, self._blocks, self.config.dx, len(self._particles.active)
+        bx, by, bz = b.shape
+        space = (self._grid, self._wall, self._rest.shares)
+        contacts = (self._parts, int(self._rest.any), self._rest.wake_speed)
+        geometry = (dt, dx, by, bz, *self.config.gravity, *self.domain.size)
+        tables = (b.table, b.lists, b.heads)
+        if self._atomic:
+            order = p.active
+            substep.advance_atomic(p.state, p.tags, order, *tables, *space, count, *contacts, *geometry)
+        else:
+            order = p.order
+            blocks.sort(p.state, p.tags, p.active, order, *tables, count, 1 / dx, bx, by, bz)
+            b.make_room()
             count = int(b.heads[blocks.N_PARTICLES])  # without those that left in this step
-        else:
-            blocks.touch(*listing, by, bz)
-            transfer.scatter_atomic(p.state, p.tags, self._grid, p.order, count, dt, dx, by, bz)
-        resting, size = int(self._resting), self.domain.size
-        contact.move_nodes(self._grid, self._wall, self._rest, b.lists, b.heads, self._parts, resting, dt, *self.config.gravity)
-        transfer.gather(p.state, p.tags, self._grid, self._wall, p.order, count, self._parts, dt, dx, by, bz, *size)
-        constitutive.respond(p.state, p.tags, p.signal, p.table, p.order, count, dt)
-
-    def _longest_dt(self) -> float:
-        fastest = float(self._particles.signal[: len(self)].max())
-        if not math.isfinite(fastest):
-            self._particles.require_finite(self.seconds)
-            raise FloatingPointError(f"the speed of sound is not finite at {self.seconds:.6g} s")
-        reach = self.config.courant * self.config.dx
-        longest = reach / max(fastest, 1e-30)
-        pull = math.sqrt(sum(g * g for g in self.config.gravity))
-        if pull > 0:  # for what starts from rest and has no stiffness to speak of
-            longest = min(longest, math.sqrt(reach / pull))
-        return min(longest, self.config.max_dt or math.inf)
-
-    def _cause(self, seconds: float, needed: int, dt: float) -> str:
-        p = self._particles
-        worst = int(p.signal[: len(self)].argmax())
-        speed = float(p.state[worst, V : V + 3].norm())
-        sound = max(float(p.signal[worst]) - speed, 0.0)
-        matter = p.materials[int(p.tags[worst, MATERIAL])]
-        if self.config.max_dt is not None and dt >= self.config.max_dt:
-            cause, remedy = f"max_dt is {self.config.max_dt:g} s", "raise max_dt"
-        elif speed > sound:
-            cause, remedy = f"a particle of {matter.name} moves at {speed:.3g} m/s", "take shorter steps or a larger dx"
-        else:
-            cause, remedy = f"sound travels at {sound:.3g} m/s in {matter.name}", "use a softer material or a larger dx"
-            if matter.name == "snow":
-                cause += f" (plastic volume ratio {float(p.state[worst, J]):.2f})"
-        return (
-            f"a step of {seconds:g} s needs {needed} substeps of {dt:.2g} s at dx = {self.config.dx:g} m because {cause}; "
-            f"allowed are {self.config.max_substeps}: {remedy}, or raise max_substeps"
-        )
-
-    def _fall_asleep(self, sleep: Sleep) -> None:
-        p, dx, (_, by, bz) = self._particles, self.config.dx, self._blocks.shape
-        count = len(p.active)
-        if count == 0:
-            return
-        limits = (self._parts, int(self._resting), sleep.speed, sleep.frames, dx, by, bz)
-        contact.fall_asleep(p.state, p.tags, self._wall, self._rest, p.active, count, *limits)
-        new = p.active[p.tags[p.active.long(), STATE] == RESTING]
-        if len(new):
-            p.state[new.long(), V : V + 3] = 0
-            p.state[new.long(), C : C + 9] = 0
-            p.signal[new.long()] = 0
-            contact.deposit(p.state, self._rest, new, len(new), 1 / dx, by, bz)
-            self._resting = True
+            substep.advance(p.state, p.tags, order, *tables, b.halo, *space, *contacts, *geometry)
+        constitutive.respond(p.state, p.tags, p.signal, p.table, order, count, dt)
+        self._rest.wake_marked(p)
 
     def _require_alive(self) -> None:
         if self._start != started():

@@ -1,32 +1,30 @@
 """Between particles and grid: affine particle-in-cell transfers (Jiang et al. 2015) of MLS-MPM (Hu et al. 2018).
 
 Weights are quadratic B-splines. The stress enters as part of the affine momentum, 4 / dx^2 being the inverse of the spline's
-second moment.
+second moment. Mass and momentum of a node are one vector of four, and are added as one.
 """
+
+# What Taichi compiles is not what Python would run, which is all that a type checker can see.
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportGeneralTypeIssues=false
 
 import taichi as ti
 
-from pgsd_nerfstudio.physics.mpm.blocks import BEGIN, COUNT, QUEUE
-from pgsd_nerfstudio.physics.mpm.contact import pushed_out
+from pgsd_nerfstudio.physics.mpm.blocks import BEGIN, COUNT, SLOT
 from pgsd_nerfstudio.physics.mpm.layout import (
-    ACTIVE,
+    CELLS,
     EDGE,
+    HALO,
     MARGIN,
     MASS,
-    REMOVED,
-    STATE,
+    REACH,
     TAU,
-    Array1,
-    Array2,
     C,
     V,
     X,
     axis_terms,
     base_node,
+    block_at,
     read3,
-    read33,
-    write3,
-    write33,
 )
 
 
@@ -42,116 +40,113 @@ def spline(offset):
 
 
 @ti.func
-def scatter_one(state: ti.template(), grid: ti.template(), p, dt, dx, inv_dx, by, bz, atomic: ti.template()):
-    """Add a particle's mass and momentum to its nodes."""
-    x, mass = read3(state, p, X), state[p, MASS]
-    affine = mass * read33(state, p, C) - (4.0 * dt * inv_dx * inv_dx) * read33(state, p, TAU)
+def scattered(state: ti.template(), p, offset, dt, dx):
+    """What a particle gives to its lowest node, [mass, momentum] but for the weight, and how much more a node further along."""
+    mass, stress = state[p][MASS], 4.0 * dt / dx
+    c, tau = C, TAU
+    along_x = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    along_y = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    along_z = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    rows = ti.static(((0, 1, 2), (1, 3, 4), (2, 4, 5)))  # of the symmetric stress
+    for i in ti.static(range(3)):
+        along_x[i + 1] = mass * dx * state[p][c + 3 * i] - stress * state[p][tau + rows[i][0]]
+        along_y[i + 1] = mass * dx * state[p][c + 3 * i + 1] - stress * state[p][tau + rows[i][1]]
+        along_z[i + 1] = mass * dx * state[p][c + 3 * i + 2] - stress * state[p][tau + rows[i][2]]
+    first = mass * ti.Vector([1.0, state[p][V], state[p][V + 1], state[p][V + 2]])
+    return first - offset[0] * along_x - offset[1] * along_y - offset[2] * along_z, along_x, along_y, along_z
+
+
+@ti.func
+def scatter_block(state: ti.template(), halo: ti.template(), order: ti.template(), table: ti.template(), block, dt, dx, by, bz):
+    """Mass and momentum of a block's particles, into its halo."""
+    slot, corner, inv_dx = table[block, SLOT], block_at(block, by, bz) * EDGE, 1.0 / dx
+    for n in range(HALO):
+        halo[slot * HALO + n] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    for a in range(table[block, BEGIN], table[block, BEGIN] + table[block, COUNT]):
+        p = order[a]
+        x = read3(state, p, X)
+        # Should another rounding of the same formula put it into the next block, then the spline continues smoothly.
+        local = ti.min(ti.max(base_node(x, inv_dx) - corner, 0), EDGE - 1)
+        offset = x * inv_dx - (local + corner - MARGIN)
+        weights = spline(offset)
+        given, along_x, along_y, along_z = scattered(state, p, offset, dt, dx)
+        first = slot * HALO + (local[0] * REACH + local[1]) * REACH + local[2]
+        for i, j in ti.static(ti.ndrange(3, 3)):
+            here = given + i * along_x + j * along_y
+            for k in ti.static(range(3)):
+                node = first + (i * REACH + j) * REACH + k
+                halo[node] = halo[node] + weights[0, i] * weights[1, j] * weights[2, k] * here
+                here += along_z
+
+
+@ti.func
+def collect_block(grid: ti.template(), halo: ti.template(), table: ti.template(), block, by, bz):
+    """Sums of all halos over the nodes of a block, always in the same order."""
+    at = block_at(block, by, bz)
+    for n in range(CELLS):
+        grid[block * CELLS + n] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    for q in range(8):
+        back = ti.Vector([q // 4, (q // 2) % 2, q % 2])
+        owner = at - back
+        if owner.min() >= 0:
+            near = (owner[0] * by + owner[1]) * bz + owner[2]
+            if table[near, COUNT] > 0:
+                last = EDGE - 2 * back  # the halo reaches two nodes beyond its own block
+                first = table[near, SLOT] * HALO + (back[0] * REACH + back[1]) * REACH * EDGE + back[2] * EDGE
+                for i in range(last[0]):
+                    for j in range(last[1]):
+                        for k in range(last[2]):
+                            node = block * CELLS + (i * EDGE + j) * EDGE + k
+                            grid[node] = grid[node] + halo[first + (i * REACH + j) * REACH + k]
+
+
+@ti.func
+def scatter_atomic(state: ti.template(), grid: ti.template(), p, dt, dx, by, bz):
+    """Mass and momentum of a particle, onto the grid with atomics."""
+    x, inv_dx = read3(state, p, X), 1.0 / dx
     base = base_node(x, inv_dx)
     offset = x * inv_dx - (base - MARGIN)
     weights, terms = spline(offset), axis_terms(base, by, bz)
-    momentum = mass * read3(state, p, V) - affine @ (offset * dx)
+    given, along_x, along_y, along_z = scattered(state, p, offset, dt, dx)
     for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
-        w = weights[0, i] * weights[1, j] * weights[2, k]
-        node = terms[0, i] + terms[1, j] + terms[2, k]
-        given = w * (momentum + affine @ (ti.Vector([i, j, k]) * dx))
-        if ti.static(atomic):
-            grid[node, 0] += w * mass
-            for d in ti.static(range(3)):
-                grid[node, 1 + d] += given[d]
-        else:
-            grid[node, 0] = grid[node, 0] + w * mass
-            for d in ti.static(range(3)):
-                grid[node, 1 + d] = grid[node, 1 + d] + given[d]
+        here = weights[0, i] * weights[1, j] * weights[2, k] * (given + i * along_x + j * along_y + k * along_z)
+        for d in ti.static(range(4)):
+            grid[terms[0, i] + terms[1, j] + terms[2, k]][d] += here[d]
 
 
-@ti.kernel
-def scatter_colour(
-    state: Array2,
-    grid: Array2,
-    order: Array1,
-    table: Array2,
-    lists: Array2,
-    heads: Array1,
-    colour: int,
-    dt: float,
-    dx: float,
-    by: int,
-    bz: int,
-):
-    """Particles of all blocks of one colour to the grid, without atomics."""
-    ti.loop_config(block_dim=1)
-    for q in range(heads[colour], heads[colour + 1]):
-        block = lists[q, QUEUE]
-        for a in range(table[block, BEGIN], table[block, BEGIN] + table[block, COUNT]):
-            scatter_one(state, grid, order[a], dt, dx, 1.0 / dx, by, bz, False)
-
-
-@ti.kernel
-def scatter_atomic(
-    state: Array2, tags: Array2, grid: Array2, order: Array1, count: int, dt: float, dx: float, by: int, bz: int
-):
-    """All particles to the grid, with atomics."""
-    for a in range(count):
-        if tags[order[a], STATE] == ACTIVE:
-            scatter_one(state, grid, order[a], dt, dx, 1.0 / dx, by, bz, True)
-
-
-@ti.kernel
-def gather(
-    state: Array2,
-    tags: Array2,
-    grid: Array2,
-    wall: Array2,
-    order: Array1,
-    count: int,
-    parts: int,
-    dt: float,
-    dx: float,
-    by: int,
-    bz: int,
-    top_x: float,
-    top_y: float,
-    top_z: float,
-):
-    """Velocities from the grid, then one step of travel; what leaves the domain (0..top) is removed."""
-    top = ti.Vector([top_x, top_y, top_z])
-    for a in range(count):
-        p = order[a]
-        if tags[p, STATE] == ACTIVE:
-            inv_dx = 1.0 / dx
-            x = read3(state, p, X)
-            base = base_node(x, inv_dx)
-            offset = x * inv_dx - (base - MARGIN)
-            weights, terms = spline(offset), axis_terms(base, by, bz)
-            velocity = ti.Vector.zero(float, 3)
-            moment = ti.Matrix.zero(float, 3, 3)
-            for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
-                w = weights[0, i] * weights[1, j] * weights[2, k]
-                v = w * read3(grid, terms[0, i] + terms[1, j] + terms[2, k], 1)
-                velocity += v
-                moment += v.outer_product(ti.Vector([i, j, k]) - offset)
-            # The time step keeps travel below a cell; where a force made more of it, the rest waits for the next step.
-            travel = dt * velocity
-            longest = ti.max(ti.abs(travel[0]), ti.abs(travel[1]), ti.abs(travel[2]))
-            if longest > dx:
-                travel *= dx / longest
-            x += travel
-            inside = 1
-            for d in ti.static(range(3)):
-                # Whole numbers: a position that is not a number fails the test instead of passing it.
-                cell = ti.cast(ti.floor(x[d] * inv_dx), ti.i32)
-                if cell < 0 or cell > ti.cast(top[d] * inv_dx, ti.i32) + 1 or x[d] > top[d]:
-                    inside = 0
-            if inside == 1 and parts > 0:
-                x, velocity = pushed_out(wall, parts, x, velocity, inv_dx, by, bz, top)
-                for d in ti.static(range(3)):
-                    if x[d] < 0.0 or x[d] > top[d]:
-                        inside = 0
-            write3(state, p, X, x)
-            write3(state, p, V, velocity)
-            write33(state, p, C, moment * (4.0 * inv_dx))
-            if inside == 0:
-                tags[p, STATE] = REMOVED
+@ti.func
+def gathered(grid: ti.template(), x, inv_dx, by, bz):
+    """Velocity at a position and its gradient in 1/s."""
+    base = base_node(x, inv_dx)
+    offset = x * inv_dx - (base - MARGIN)
+    weights, terms = spline(offset), axis_terms(base, by, bz)
+    arms = weights  # weight times distance to the node, in cells
+    for d, i in ti.static(ti.ndrange(3, 3)):
+        arms[d, i] = weights[d, i] * (i - offset[d])
+    zero = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    mean, along_x, along_y, along_z = zero, zero, zero, zero
+    for i in ti.static(range(3)):
+        mean_i, along_y_i, along_z_i = zero, zero, zero
+        for j in ti.static(range(3)):
+            mean_ij, along_z_ij = zero, zero
+            for k in ti.static(range(3)):
+                node = grid[terms[0, i] + terms[1, j] + terms[2, k]]
+                mean_ij += weights[2, k] * node
+                along_z_ij += arms[2, k] * node
+            mean_i += weights[1, j] * mean_ij
+            along_y_i += arms[1, j] * mean_ij
+            along_z_i += weights[1, j] * along_z_ij
+        mean += weights[0, i] * mean_i
+        along_x += arms[0, i] * mean_i
+        along_y += weights[0, i] * along_y_i
+        along_z += weights[0, i] * along_z_i
+    velocity = ti.Vector([mean[1], mean[2], mean[3]])
+    gradient = ti.Matrix.zero(float, 3, 3)
+    for d in ti.static(range(3)):
+        gradient[d, 0] = 4.0 * inv_dx * along_x[d + 1]
+        gradient[d, 1] = 4.0 * inv_dx * along_y[d + 1]
+        gradient[d, 2] = 4.0 * inv_dx * along_z[d + 1]
+    return velocity, gradient
 
 
 def grid_shape(size: tuple[float, float, float], dx: float) -> tuple[int, int, int]:

@@ -1,0 +1,253 @@
+"""Asks a language model for the numbers of a wish (paper, appearance initialization), and keeps what it answered.
+
+Any provider that any-llm knows, or any server that speaks the protocol of OpenAI or Anthropic. Keys and addresses come from the
+environment (OPENAI_API_KEY and OPENAI_BASE_URL, ANTHROPIC_API_KEY and ANTHROPIC_BASE_URL, ...) and are written nowhere.
+The schema of a wish is told in words and the answer is judged by Wish.from_json: not every server knows structured output.
+Nothing stands in for a model that does not answer unless the caller says so.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from pgsd_nerfstudio.storage import cache_dir as shared_cache
+from pgsd_nerfstudio.storage import content_key
+from pgsd_nerfstudio.weather.reader import NO_WEATHER, check, read
+from pgsd_nerfstudio.weather.wish import SCHEMA, Wish
+
+RETRIES = 1  # of a request that got no answer or an error that may pass
+MODEL = re.compile(r"(?P<provider>[a-z0-9_]+):(?P<name>\S+)")
+HOW_TO_NAME = (
+    "PROVIDER:NAME such as openai:NAME, anthropic:NAME, or vllm:NAME for a server of your own that speaks OpenAI's protocol "
+    "(then its address too, http://127.0.0.1:8000/v1)"
+)
+INSTRUCTIONS = f"""\
+You turn a short description of weather, or of anything else that fills the air, into numbers for a simulation of particles in a
+3D Gaussian Splatting scene: how they look, in the air and landed, and how they move. The numbers turn the knobs of one of four
+base effects; choose the one that moves most like what is described, and numbers that a physicist and a painter would accept.
+Leave at its default whatever the description says nothing about. If nothing in it could be in the air, base is null.
+Answer with one JSON object and nothing else. It must satisfy this JSON schema:
+{json.dumps(SCHEMA)}"""
+
+
+class AskingError(ValueError):
+    """The language model gave no usable answer; the message says why and what to do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Granted:
+    """A wish, and who understood it."""
+
+    wish: Wish
+    by: str
+    """The model, or the word "reader"."""
+    remark: str
+    """What the reader used and ignored, and why it had to step in if a model was asked first."""
+
+
+def wish_for(
+    prompt: str,
+    *,
+    model: str | None = None,
+    base_url: str | None = None,
+    cache_dir: Path | None = None,
+    timeout: float = 60.0,
+    reader_fallback: bool = False,
+) -> Granted:
+    """What a text wishes for: by a language model where one is named, else by the built-in reader.
+
+    Args:
+        reader_fallback: let the reader answer where the model cannot be asked; the remark then says so.
+        model, base_url, cache_dir, timeout: as for `ask`; answers are kept in the common cache if no folder is given.
+
+    Raises:
+        AskingError: the model gave no usable answer, and the reader was not allowed to step in.
+        ValueError: the text is empty, too long or names nothing that could be in the air.
+    """
+    if model is None:
+        reading = read(prompt)
+        return Granted(wish=reading.wish, by="reader", remark=str(reading))
+    folder = cache_dir or shared_cache() / "wishes"
+    try:
+        return Granted(wish=ask(prompt, model=model, base_url=base_url, cache_dir=folder, timeout=timeout), by=model, remark="")
+    except AskingError as error:
+        if not reader_fallback:
+            raise
+        reading = read(prompt)
+        return Granted(wish=reading.wish, by="reader", remark=f"{error}. Read without it: {reading}")
+
+
+def ask(prompt: str, *, model: str, base_url: str | None = None, cache_dir: Path, timeout: float = 60.0) -> Wish:
+    """What a text wishes for, in the words of a language model; the same question is asked once and its answer kept.
+
+    Args:
+        model: PROVIDER:NAME, such as "openai:gpt-5-mini".
+        base_url: address of the server, if it is not the provider's own or the one in the environment.
+        cache_dir: folder of the answers, wish-HASH.json each; the hash is that of prompt, model, address and instructions.
+        timeout: seconds to wait for an answer, each of two times.
+
+    Raises:
+        AskingError: the library for it is not installed, the model cannot be reached or does not answer in time, refuses, or
+            twice answers nonsense; or a kept answer was damaged.
+        ValueError: the text is empty, too long, or names nothing that could be in the air.
+        OSError: the answer cannot be written.
+    """
+    check(prompt)
+    prompt = prompt.strip()
+    kept = cache_dir / f"wish-{content_key(prompt, model, base_url, INSTRUCTIONS)}.json"
+    if kept.is_file():
+        wish = _kept(kept)
+    else:
+        wish = _asked(prompt, model, base_url, timeout)
+        _keep(kept, {"prompt": prompt, "model": model, "wish": json.loads(wish.to_json())})
+    if wish.base is None:
+        raise ValueError(f"{prompt!r} {NO_WEATHER} (so says {model})")
+    return wish
+
+
+def _asked(prompt: str, model: str, base_url: str | None, timeout: float) -> Wish:
+    connection = Connection.open(model, base_url, timeout)
+    messages = [{"role": "system", "content": INSTRUCTIONS}, {"role": "user", "content": prompt}]
+    answer = connection.answer(messages)
+    try:
+        return Wish.from_json(_object_in(answer))
+    except ValueError as fault:
+        messages += [
+            {"role": "assistant", "content": answer or "(nothing)"},
+            {"role": "user", "content": f"That cannot be used: {fault}. Answer again with the corrected JSON object alone."},
+        ]
+    try:
+        return Wish.from_json(_object_in(connection.answer(messages)))
+    except AskingError:
+        raise
+    except ValueError as fault:
+        raise AskingError(f"{model} was asked twice and gave no usable answer: {fault}; try another model") from fault
+
+
+def _object_in(answer: str) -> str:
+    """The JSON object in an answer, without the thoughts before and the fences around it."""
+    answer = re.sub(r"<think>.*?</think>", "", answer, flags=re.DOTALL)
+    for brace in re.finditer(r"\{", answer):
+        try:
+            _, end = json.JSONDecoder().raw_decode(answer, brace.start())
+        except ValueError:
+            continue
+        return answer[brace.start() : end]
+    return answer.strip()
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A provider's client that answers messages, or says in one sentence why it does not."""
+
+    client: Any
+    model: str
+    name: str
+    base_url: str | None
+    timeout: float
+
+    @staticmethod
+    def open(model: str, base_url: str | None, timeout: float) -> Connection:
+        try:
+            from any_llm import AnyLLM
+            from any_llm.exceptions import AnyLLMError, MissingApiKeyError, UnsupportedProviderError
+        except ImportError as error:
+            version = "" if sys.version_info >= (3, 11) else ", on Python 3.11 or later"
+            raise AskingError(
+                f"asking {model} needs the library any-llm{version}: pip install 'pgsd-nerfstudio[llm]'"
+            ) from error
+        named = MODEL.fullmatch(model)
+        if not named:
+            raise AskingError(f"a language model must be named {HOW_TO_NAME}, found {model!r}")
+        provider = named["provider"]
+        if base_url is not None and not re.match(r"https?://[^/]", base_url):
+            raise AskingError(f"the address of {model} must begin with http:// or https:// and a host, found {base_url!r}")
+        try:
+            client = AnyLLM.create(provider, api_base=base_url, unified_exceptions=True, max_retries=RETRIES)
+        except UnsupportedProviderError as error:
+            raise AskingError(f"there is no provider {provider!r}; name the model {HOW_TO_NAME}") from error
+        except MissingApiKeyError as error:
+            key = f"a key in the environment: export {error.env_var_name}=..."
+            keyless = "; a server of your own that wants none is asked as vllm:NAME" if base_url else ""
+            raise AskingError(f"asking {model} needs {key}{keyless}") from error
+        except ImportError as error:
+            raise AskingError(f"asking {model} needs one more library: pip install 'any-llm-sdk[{provider}]'") from error
+        except AnyLLMError as error:
+            raise AskingError(f"{model} cannot be asked: {_line(error)}") from error
+        return Connection(client, model, named["name"], base_url, timeout)
+
+    def answer(self, messages: list[dict[str, str]]) -> str:
+        """What the model says next.
+
+        Raises:
+            AskingError: it says nothing.
+        """
+        from any_llm.exceptions import AnyLLMError
+
+        try:
+            completion = self.client.completion(model=self.name, messages=messages, timeout=self.timeout)
+        except AnyLLMError as error:
+            raise AskingError(self._why(error)) from error
+        choices = completion.choices
+        return (choices[0].message.content or "") if choices else ""
+
+    def _why(self, error: Any) -> str:
+        status = error.status_code
+        if status in (401, 403):
+            # The server's own words may repeat a part of the key.
+            return f"{self.model} refused the key in {self.client.ENV_API_KEY_NAME} (HTTP {status}); check it"
+        if status == 404:
+            return f"{self._place} knows no model {self.name!r}, or is not the address of its API (HTTP 404)"
+        if status == 429:
+            return f"{self.model} has too many requests or no credit left (HTTP 429); wait, or ask another model"
+        if status is not None and status >= 400:
+            advice = "try again later or ask another model" if status >= 500 else "ask another model"
+            return f"{self.model} answered with an error (HTTP {status}: {_line(error)}); {advice}"
+        causes = list(_causes(error))
+        if any("timeout" in type(cause).__name__.lower() for cause in causes):
+            return f"{self.model} gave no answer within {self.timeout:g} s, asked {RETRIES + 1} times; allow it more time"
+        if any("connect" in type(cause).__name__.lower() for cause in causes):
+            return f"{self._place} cannot be reached ({_line(causes[-1])}); is there a network, and is the address right?"
+        return f"{self._place} did not speak the protocol of its provider ({_line(error)}); is that the address of its API?"
+
+    @property
+    def _place(self) -> str:
+        """Where the question goes, without a password that may stand in the address."""
+        address = urlsplit(str(getattr(self.client.client, "base_url", "") or self.base_url or ""))
+        return f"{self.model.partition(':')[0]} at {address.hostname}{f':{address.port}' if address.port else ''}"
+
+
+def _causes(error: BaseException | None) -> Any:
+    while error is not None:
+        yield error
+        error = getattr(error, "original_exception", None) or error.__cause__ or error.__context__
+
+
+def _line(error: BaseException) -> str:
+    words = " ".join(str(getattr(error, "message", error)).split()) or type(error).__name__
+    return words if len(words) <= 200 else f"{words[:197]}..."
+
+
+def _kept(path: Path) -> Wish:
+    try:
+        return Wish.from_json(json.dumps(json.loads(path.read_text("utf-8"))["wish"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise AskingError(f"the kept answer {path} is damaged ({_line(error)}); correct or delete it") from error
+
+
+def _keep(path: Path, answer: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        beside.write_text(json.dumps(answer, indent=2, ensure_ascii=False) + "\n", "utf-8")
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
