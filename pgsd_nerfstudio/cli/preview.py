@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -29,6 +29,9 @@ class Preview:
     """Folder of transforms.json, or the file; a .ply needs it for its cameras."""
     effect: str = "snowfall"
     """Which weather."""
+    weather: str | None = None
+    """The weather in words, such as "purple snow" or "glittering yellow sand"; understood by a built-in reader, in place of
+    --effect."""
     output: Path = Path("preview.mp4")
     """Where the video goes; its last frame goes beside it as .png."""
     frames: int = 50
@@ -65,12 +68,11 @@ class Preview:
         from rich.progress import track
 
         from pgsd_nerfstudio.cli.video import write_picture, write_video
-        from pgsd_nerfstudio.weather import effect as weather_effect
 
         self._check()
         began = time.perf_counter()
         with refusing(ValueError, FileNotFoundError):
-            effect = weather_effect(self.effect, intensity=self.intensity, exposure=self.exposure)
+            effect = self._effect()
             say(f"opening {self.load_scene}")
             scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
             cameras = self._cameras(scene)
@@ -102,6 +104,27 @@ class Preview:
             raise Refusal(f"--output must end in .mp4, got {self.output}")
         if self.start is not None and not self.start >= 0:
             raise Refusal(f"--start must not be negative, got {self.start:g} s")
+        if self.weather is not None and self.effect != Preview.effect:
+            raise Refusal(f"--weather stands in place of --effect, got both {self.weather!r} and {self.effect}: leave out one")
+
+    def _effect(self) -> Effect:
+        """The effect of that name, or the one that the words for the weather ask for."""
+        from pgsd_nerfstudio.weather import effect as weather_effect
+
+        if self.weather is None:
+            return weather_effect(self.effect, intensity=self.intensity, exposure=self.exposure)
+        from pgsd_nerfstudio.weather.granting import granted, remarks
+        from pgsd_nerfstudio.weather.reader import read
+
+        reading = read(self.weather)
+        effect, lacks = granted(reading.wish), remarks(reading.wish)
+        if self.intensity is not None:
+            effect = replace(effect, emission=replace(effect.emission, intensity=self.intensity))
+        if self.exposure is not None:
+            effect = replace(effect, appearance=replace(effect.appearance, exposure=self.exposure))
+        for line in (str(reading), *lacks):
+            say(line)
+        return effect
 
     def _make_folder(self) -> None:
         """The folder of the output, before anything costly is done."""

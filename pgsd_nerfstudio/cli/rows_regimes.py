@@ -146,7 +146,7 @@ def _wet_error() -> float:
 
 
 def _diffusion_error() -> float:
-    cloud = replace(FOG, wind=replace(STILL, diffusivity=0.02))
+    cloud = replace(FOG, wind=replace(STILL, diffusivity=0.02), emission=replace(FOG.emission, most=None))
     run: ParticleHistory = simulate(SurfaceMesh.empty(), cloud, Clock(frames=41), DOMAIN, max_particles=6000, progress=False)
     ids = ((run.births == 0) & (run.ends == 41)).nonzero()[:, 0]
     start = run.positions_at(0, ids)

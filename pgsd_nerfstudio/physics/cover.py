@@ -1,9 +1,9 @@
 """The cover that landed matter makes: a thickness on the scene's surfaces, never steeper than its angle of repose.
 
 Thickness is counted upwards, on the levels of `columns`. What a particle leaves is spread over a disc, as its patch is drawn.
-Where the raised surface is steeper than the angle of repose, cover moves to the lowest neighbour until it is not, the sandpile
-rule (Bak, Tang & Wiesenfeld 1987, with real heights); a `film` of it clings to any slope. The result grows only: what moves is
-never more than what a place has too much. Volume is kept to round-off.
+Where the raised surface is steeper than the angle of repose, cover runs down until it is not (`toppling`); a `film` clings to
+any slope. Cover falls over edges onto what is below, and is lost where nothing is; at the border of the domain the surface is
+taken to go on as it comes, under the same cover. What lies only grows. Volume is kept to round-off: deposited = held + lost.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.columns import Columns
+from pgsd_nerfstudio.physics.toppling import topple
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 
@@ -43,11 +44,11 @@ class CoverConfig:
 
     def __post_init__(self) -> None:
         for name in ("cell", "gap", "tolerance", "slack", "most_moves"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"a cover needs a positive {name}, got {getattr(self, name):g}")
         if not 0 < self.repose_degrees < 90:
             raise ValueError(f"the angle of repose must lie in 0-90 degrees, got {self.repose_degrees:g}")
-        if not self.film >= 0:
+        if not 0 <= self.film < math.inf:
             raise ValueError(f"a film must not be negative, got {self.film:g} m")
 
 
@@ -56,8 +57,10 @@ class Cover:
 
     def __init__(self, columns: Columns, config: CoverConfig) -> None:
         self.columns, self.config = columns, config
-        self.heights: Float[ndarray, "l"] = np.zeros(len(columns))  # m
-        self._changed: list[ndarray] = []
+        self.heights: Float[ndarray, "l"] = np.zeros(len(columns.base))  # m
+        self.lost = 0.0  # m^3 so far that ran off where nothing is
+        self._rested = self.heights.copy()  # when all of it was last at rest
+        self._changed = np.zeros(len(columns.base), np.bool_)  # since they last were at rest
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, config: CoverConfig | None = None) -> Cover:
@@ -68,52 +71,53 @@ class Cover:
     def deposit(self, points: Float[ndarray, "n 3"], volumes: Float[ndarray, "n"], radii: Float[ndarray, "n"]) -> float:
         """Add m^3 of cover at points, each spread over a disc of its radius in metres (a paraboloid: thickest in the middle).
 
-        Returns the volume of points that belong to no level, which is not added.
+        The disc is horizontal and ends where its sheet does; a radius that reaches no middle of a square fills one square.
+        Returns the volume of points that belong to no level, also of those that are no numbers, which is not added.
 
         Raises:
-            ValueError: a volume is negative or not finite.
+            ValueError: a volume or radius is negative or not finite, or there are not as many of them as points.
         """
-        volumes, radii = (np.ascontiguousarray(values, np.float64) for values in (volumes, radii))
-        if not (np.isfinite(volumes).all() and (volumes >= 0).all()):
-            raise ValueError(f"volumes of cover must be finite and not negative, found {volumes.min(initial=0.0):g} m^3")
-        c = self.columns
-        level = c.find(points, self.heights, self.config.tolerance)
-        touched = np.zeros(len(c), np.bool_)
-        missed = _spread(
-            level, points[:, :2].astype(np.float64), volumes, radii, self.heights, touched, c.column, c.base, c.first,
-            c.lower, c.cell, *c.shape,
-        )  # fmt: skip
-        self._changed.append(touched.nonzero()[0])
-        return missed
+        volumes, radii = _amounts("volumes", volumes, len(points), "m^3"), _amounts("radii", radii, len(points), "m")
+        points = np.ascontiguousarray(points, np.float64)
+        level = self.find(points)
+        _spread(level, points, volumes, radii, self.heights, self._changed, self.columns)
+        return float(volumes[level < 0].sum())
 
     def relax(self) -> bool:
-        """Let what is too steep run down; True when all of it has found its place, False where `most_moves` was not enough."""
-        start = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed]))
-        if len(start) == 0:
-            return True
-        self._changed = []
+        """Let what is too steep run down; True when all of it has found its place, False where `most_moves` was not enough.
+
+        The next call goes on where this one stopped.
+        """
         c, config = self.columns, self.config
-        moves = config.most_moves * max(len(c), 1)
         steep = math.tan(math.radians(config.repose_degrees)) * c.cell
-        left = _topple(start, self.heights, c.base, c.neighbours, c.below, steep, config.film, config.slack, moves)
-        if len(left):
-            self._changed.append(left)
+        most = config.most_moves * len(self.heights)
+        start = self._changed.nonzero()[0]
+        left, lost = topple(start, self.heights, self._rested, c, steep, config.film, config.slack, most)
+        self.lost += lost * c.cell**2
+        self._changed[:] = False
+        self._changed[left] = True
+        if len(left) == 0:
+            self._rested[:] = self.heights
         return len(left) == 0
+
+    def find(self, points: Float[ndarray, "n 3"]) -> Int[ndarray, "n"]:
+        """Level that each point belongs to: in its cover or near its surfaces; -1 where there is none."""
+        return self.columns.find(points, self.heights, self.config.tolerance)
 
     def height(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Thickness in metres at points on or near the surface, smooth within a sheet; 0 where there is no level."""
-        return self._ask(points)[0]
+        return _read(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
 
     def above(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Height in metres of points above the bare surface beneath them, not negative; 0 where there is no level."""
-        level = self.columns.find(points, self.heights, self.config.tolerance)
-        if len(self.columns) == 0:
-            return np.zeros(len(points))
-        return np.where(level >= 0, points[:, 2] - self.columns.base[level], 0.0).clip(0.0)
+        level, above = self.find(points), np.zeros(len(points))
+        known = level >= 0
+        above[known] = points[known, 2] - self.columns.base[level[known]]
+        return above.clip(0.0)
 
     def normal(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Unit normals of the raised surface; straight up where there is no level."""
-        _, slopes = self._ask(points)
+        """Unit normals of the raised surface, smooth within a sheet; straight up where there is no level."""
+        slopes = _slopes(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
         normal = np.column_stack([-slopes, np.ones(len(slopes))])
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -129,144 +133,130 @@ class Cover:
 
     def snapshot(self) -> dict[str, ndarray]:
         """Its state."""
-        return {"heights": self.heights.copy(), "changed": np.concatenate([np.zeros(0, np.int64), *self._changed])}
+        changed = self._changed.nonzero()[0]
+        rested = self._rested if len(changed) else self._rested[:0]  # at rest it says nothing new
+        return {"heights": self.heights.copy(), "rested": rested.copy(), "changed": changed, "lost": np.array([self.lost])}
 
     def restore(self, arrays: Mapping[str, ndarray]) -> None:
-        """The state that `snapshot` gave."""
-        self.heights, self._changed = arrays["heights"].copy(), [arrays["changed"].copy()]
+        """The state that `snapshot` gave.
 
-    def _ask(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, "n"], Float[ndarray, "n 2"]]:
-        c = self.columns
-        level = c.find(points, self.heights, self.config.tolerance)
-        heights, slopes = np.zeros(len(points)), np.zeros((len(points), 2))
-        at = points[:, :2].astype(np.float64)
-        _read(level, at, self.heights, c.column, c.base, c.neighbours, c.lower, c.cell, c.shape[1], heights, slopes)
-        return heights, slopes
+        Raises:
+            ValueError: it is that of another surface.
+        """
+        if arrays["heights"].shape != self.heights.shape:
+            found = len(arrays["heights"])
+            raise ValueError(f"the state of a cover with {len(self.heights)} levels was expected, got one with {found}")
+        self.heights = arrays["heights"].copy()
+        self._changed = np.zeros(len(self.heights), np.bool_)
+        self._changed[arrays["changed"]] = True
+        self._rested = (arrays["rested"] if len(arrays["changed"]) else self.heights).copy()
+        self.lost = float(arrays["lost"][0])
+
+
+def _amounts(name: str, values: Float[ndarray, "n"], count: int, unit: str) -> Float[ndarray, "n"]:
+    values = np.ascontiguousarray(values, np.float64)
+    if values.shape != (count,):
+        raise ValueError(f"{name} of cover must be one for each of {count} points, got {values.shape}")
+    wrong = ~(np.isfinite(values) & (values >= 0))
+    if wrong.any():
+        raise ValueError(f"{name} of cover must be finite and not negative, got {values[wrong][0]:g} {unit}")
+    return values
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _walk(level, i, j, neighbours):
+    """Level that is i and j squares away on the same sheet, diagonals first; negative where the sheet ends before."""
+    right = 0 if i > 0 else 2
+    ahead = 1 if j > 0 else 3
+    corner = (4 if j > 0 else 7) if i > 0 else (5 if j > 0 else 6)
+    i, j = abs(i), abs(j)
+    while level >= 0 and (i > 0 or j > 0):
+        level = neighbours[level, corner if i > 0 and j > 0 else (right if i > 0 else ahead)]
+        i, j = max(i - 1, 0), max(j - 1, 0)
+    return level
 
 
 @numba.njit(cache=True, nogil=True)
-def _spread(level, at, volumes, radii, heights, touched, column, base, first, lower, cell, nx, ny):
-    missed = 0.0
-    area = cell * cell
+def _spread(level, points, volumes, radii, heights, touched, columns):
+    lower, cell = columns.lower, columns.cell
+    nx, ny = columns.shape
     for n in range(len(level)):
         own = level[n]
         if own < 0:
-            missed += volumes[n]
             continue
-        radius = max(radii[n], 1e-9)
-        reach = int(radius / cell) + 1
-        x, y = column[own] // ny, column[own] % ny
-        for passing in range(2):
-            if passing == 0:
-                total = 0.0
-            for i in range(max(x - reach, 0), min(x + reach + 1, nx)):
-                for j in range(max(y - reach, 0), min(y + reach + 1, ny)):
-                    du = lower[0] + (i + 0.5) * cell - at[n, 0]
-                    dv = lower[1] + (j + 0.5) * cell - at[n, 1]
-                    square = (du * du + dv * dv) / (radius * radius)
-                    if square >= 1.0:
-                        continue
-                    gap, best = 0.05 + 1.7 * math.sqrt(du * du + dv * dv), -1
-                    for m in range(first[i * ny + j], first[i * ny + j + 1]):
-                        apart = abs(base[m] - base[own])
-                        if apart <= gap:
-                            gap, best = apart, m
-                    if best < 0:
-                        continue
-                    if passing == 0:
-                        total += 1.0 - square
-                    else:
-                        heights[best] += volumes[n] / area * (1.0 - square) / total
-                        touched[best] = True
-            if total == 0.0:
-                heights[own] += volumes[n] / area
+        reach = int(min(radii[n] / cell, float(max(nx, ny)))) + 1
+        x, y = columns.column[own] // ny, columns.column[own] % ny
+        u = (points[n, 0] - lower[0]) / cell - x - 0.5
+        v = (points[n, 1] - lower[1]) / cell - y - 0.5
+        inverse = (cell / radii[n]) ** 2 if radii[n] > 0.0 else np.inf
+        thickness, total = volumes[n] / (cell * cell), 0.0
+        for passing in range(2):  # first how much weight finds a place, then the volume
+            for i in range(-reach, reach + 1):
+                for j in range(-reach, reach + 1):
+                    weight = 1.0 - ((i - u) ** 2 + (j - v) ** 2) * inverse
+                    if weight > 0.0:
+                        onto = _walk(own, i, j, columns.neighbours)
+                        if onto >= 0 and passing == 0:
+                            total += weight
+                        elif onto >= 0:
+                            heights[onto] += thickness * weight / total
+                            touched[onto] = True
+            if total <= 0.0:
+                heights[own] += thickness
                 touched[own] = True
                 break
-    return missed
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _around(own, u, v, columns):
+    """The levels of the sheet at the corners of the square of middles around a point, and their weights; -1 for none."""
+    ny = columns.shape[1]
+    x, y = columns.column[own] // ny, columns.column[own] % ny
+    u = min(max((u - columns.lower[0]) / columns.cell - x - 0.5, -0.5), 0.5)
+    v = min(max((v - columns.lower[1]) / columns.cell - y - 0.5, -0.5), 0.5)
+    i, j = (1 if u >= 0 else -1), (1 if v >= 0 else -1)
+    neighbours = columns.neighbours
+    levels = (own, _walk(own, i, 0, neighbours), _walk(own, 0, j, neighbours), _walk(own, i, j, neighbours))
+    u, v = abs(u), abs(v)
+    shares = ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v)
+    return levels, shares
 
 
 @numba.njit(cache=True, nogil=True)
-def _topple(start, heights, base, neighbours, below, steep, film, slack, most):
-    """Levels are visited from a queue; one that gave or got is visited again with those around it. Returns what was left."""
-    count = len(heights)
-    queued = np.zeros(count, np.bool_)
-    queue = np.empty(count + 1, np.int64)
-    head, size = 0, 0
-    for level in start:
-        queue[size] = level
-        queued[level] = True
-        size += 1
-    moves = 0
-    while size > 0 and moves < most:
-        level = queue[head]
-        head = (head + 1) % (count + 1)
-        size -= 1
-        queued[level] = False
-        loose = heights[level] - film
-        if loose <= slack:
-            continue
-        worst, onto, give = slack, -1, 0.0
-        top = base[level] + heights[level]
-        for k in range(8):
-            step = steep * (1.0 if k < 4 else 1.4142135623730951)
-            other = neighbours[level, k]
-            if other >= 0:
-                excess = top - base[other] - heights[other] - step
-                share = 0.5 * excess
-            elif other == -2 and below[level, k] >= 0:
-                # Beyond an edge there is nothing to lean on: as if the surface went on bare, half a square away.
-                other = below[level, k]
-                excess = loose - 0.5 * step
-                share = excess
-            else:
-                continue
-            excess /= 1.0 if k < 4 else 1.4142135623730951  # the steepest, not the lowest
-            if excess > worst:
-                worst, onto, give = excess, other, share
-        if onto < 0:
-            continue
-        moves += 1
-        give = min(give, loose)
-        heights[level] -= give
-        heights[onto] += give
-        for k in range(-2, 8):
-            near = level if k == -2 else (onto if k == -1 else neighbours[level, k])
-            if near >= 0 and not queued[near]:
-                queued[near] = True
-                queue[(head + size) % (count + 1)] = near
-                size += 1
-    left = np.empty(size, np.int64)
-    for n in range(size):
-        left[n] = queue[(head + n) % (count + 1)]
-    return left
-
-
-@numba.njit(cache=True, nogil=True)
-def _read(level, at, heights, column, base, neighbours, lower, cell, ny, out, slopes):
-    """Bilinear thickness and the slope of the raised surface; where the sheet ends, its last values go on."""
+def _read(level, points, heights, columns):
+    """Bilinear thickness; where the sheet ends, the levels that exist share the weight."""
+    found = np.zeros(len(level))
     for n in range(len(level)):
-        own = level[n]
-        if own < 0:
-            continue
-        x, y = column[own] // ny, column[own] % ny
-        u = (at[n, 0] - lower[0]) / cell - x - 0.5
-        v = (at[n, 1] - lower[1]) / cell - y - 0.5
-        u, v = min(max(u, -0.5), 0.5), min(max(v, -0.5), 0.5)
-        across = 0 if u >= 0 else 2
-        along = 1 if v >= 0 else 3
-        corner = (4 if v >= 0 else 7) if u >= 0 else (5 if v >= 0 else 6)
-        a, b, c = neighbours[own, across], neighbours[own, along], neighbours[own, corner]
-        ha = heights[a] if a >= 0 else heights[own]
-        hb = heights[b] if b >= 0 else heights[own]
-        hc = heights[c] if c >= 0 else (heights[own] if (a < 0 and b < 0) else (ha if b < 0 else hb))
-        u, v = abs(u), abs(v)
-        out[n] = (1 - u) * (1 - v) * heights[own] + u * (1 - v) * ha + (1 - u) * v * hb + u * v * hc
-        for axis in range(2):
-            plus, minus = neighbours[own, axis], neighbours[own, axis + 2]
-            if plus < 0:
-                plus = own
-            if minus < 0:
-                minus = own
-            if plus != minus:
-                run = cell * (2.0 if (plus != own and minus != own) else 1.0)
-                slopes[n, axis] = (base[plus] + heights[plus] - base[minus] - heights[minus]) / run
+        if level[n] >= 0:
+            levels, shares = _around(level[n], points[n, 0], points[n, 1], columns)
+            total = 0.0
+            for m in range(4):
+                if levels[m] >= 0:
+                    found[n] += shares[m] * heights[levels[m]]
+                    total += shares[m]
+            found[n] /= total
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _slopes(level, points, heights, columns):
+    """Rise per run of the raised surface along x and y: central differences at the middles, bilinear between them."""
+    found = np.zeros((len(level), 2))
+    for n in range(len(level)):
+        if level[n] >= 0:
+            levels, shares = _around(level[n], points[n, 0], points[n, 1], columns)
+            total = 0.0
+            for m in range(4):
+                own = levels[m]
+                if own < 0:
+                    continue
+                total += shares[m]
+                for axis in range(2):
+                    plus, minus = columns.neighbours[own, axis], columns.neighbours[own, axis + 2]
+                    steps = (plus >= 0) + (minus >= 0)
+                    plus, minus = (plus if plus >= 0 else own), (minus if minus >= 0 else own)
+                    if steps > 0:
+                        rise = columns.base[plus] + heights[plus] - columns.base[minus] - heights[minus]
+                        found[n, axis] += shares[m] * rise / (steps * columns.cell)
+            found[n] /= total
+    return found

@@ -18,7 +18,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.appearance import REACH, layer_volume
 from pgsd_nerfstudio.weather.effect import Effect
 
-WETTEST = 1e6  # squares of the plan from which the cells of wetness grow with the scene
+WETTEST = 2e5  # squares of the plan from which the cells of wetness grow with the scene
 
 
 class Deposits:
@@ -100,7 +100,7 @@ class Deposits:
         """Totals for the report: m^3 of cover, kg of water."""
         totals: dict[str, float] = {}
         if self.cover is not None:
-            totals |= {"cover_m3": self.cover.volume, "cover_missed_m3": self.missed}
+            totals |= {"cover_m3": self.cover.volume, "cover_lost_m3": self.cover.lost, "cover_missed_m3": self.missed}
         if self.wetness is not None:
             wet = self.wetness
             totals |= {"water_kg": wet.held, "water_deposited_kg": wet.deposited, "water_evaporated_kg": wet.evaporated}

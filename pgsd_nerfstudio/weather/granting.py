@@ -1,0 +1,178 @@
+"""What a Wish makes of an Effect: the knobs of a built-in weather, turned as far as its laws allow.
+
+Sizes: a particle shall look wider by the factor, and nothing else of it shall change (`fall_speed` and `amount` are for that).
+Snow has power laws over the diameter, and its spectrum is one of melted flakes, so the flake itself is enlarged: s times as
+wide, with the mass and the fall speed of the flake of which it is an enlarged copy. That is loose, as petals, leaves and
+feathers are, and the fits of Locatelli & Hobbs are still only used where they were made. Rain, sand and fog have laws that know
+the true diameter: drops above 7 mm break up (Beard 1976), the spectra of rain, blown sand and fog end at 6, 2 and 0.2 mm, and
+sizes moved towards such an end would not grow by the factor. There the diameters stay, and the Gaussian that shows a drop, a
+grain or a parcel is scaled instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pgsd_nerfstudio.weather.effect import EFFECTS, Appearance, Effect, StateLook, Wind
+from pgsd_nerfstudio.weather.matter import Emission, Kind, Material
+from pgsd_nerfstudio.weather.touch import SurfaceResponse
+from pgsd_nerfstudio.weather.wish import Wish
+
+INTENSITIES: dict[Kind, tuple[float, float]] = {
+    "snowflakes": (0.0, 100.0),
+    "raindrops": (0.1, 200.0),
+    "fog droplets": (5.0, 10_000.0),
+    "sand grains": (5.0, 10_000.0),
+}
+"""Within these an Emission takes its intensity, in its unit."""
+GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
+"""Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
+is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the
+snowflakes are opaque and the rest fade."""
+
+
+def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
+    """The effect that a wish asks for; what it says nothing about stays as the base has it.
+
+    - `rgb`, `landed_rgb`: colour in the air and landed; None keeps the base's.
+    - `size`: see the module.
+    - `amount`: precipitation times it, or visibility divided by it, within INTENSITIES. Fog, whose parcels stand for droplets
+      of a given extinction, gets more parcels if they are smaller or hold more, so that none has to be darker than opaque.
+    - `opacity`: of every particle, at most 1. What takes its opacity from its extinction (fog) keeps it.
+    - `glitter`: nothing here reflects, so to sparkle is to differ: brightness and opacity in the air vary more from particle to
+      particle, from the base's spreads (0) to GLITTER_TONES and GLITTER_OPACITIES (1).
+    - `fall_speed`: factor of the law of fall speeds. At the same precipitation slower particles are closer together.
+    - `wind`: mean wind, turbulence and the eddies below it. Gusts are a share of the mean wind and grow with it.
+    - `tumbling`: speed of the swaying at the same rate, so wider circles. What does not sway by itself (all but snow) stays so.
+    - `accumulates`: False lets particles vanish where they land: they are absorbed as rain is, without a splash, raise no
+      cover and have no opacity. True changes nothing: snow and sand gather anyway, rain and fog do not (see `remarks`).
+    - `prompt`: as it is. `name` stays that of the base: the paper's physics is looked up by it.
+
+    Args:
+        base: the effect whose knobs are turned, instead of the built-in one that the wish names (snowfall, if it names none).
+    """
+    base = base or _base_of(wish)
+    return replace(
+        base,
+        emission=_emission(wish, base),
+        material=_material(wish, base.material),
+        wind=_wind(wish, base.wind),
+        surface=_surface(wish, base.surface),
+        appearance=_appearance(wish, base),
+        prompt=wish.prompt,
+    )
+
+
+def remarks(wish: Wish, *, base: Effect | None = None) -> tuple[str, ...]:
+    """One sentence for each part of a wish that `granted` cannot grant, or not in full."""
+    base = base or _base_of(wish)
+    emission, said = base.emission, list[str]()
+    wanted, given = _wanted_intensity(wish, emission), _intensity(wish, emission)
+    if given != wanted:
+        low, high = INTENSITIES[emission.kind]
+        said.append(
+            f"amount {wish.amount:g} would be {wanted:g} {emission.unit}: {given:g} it is, {base.name} has {low:g}-{high:g}"
+        )
+    if wish.opacity != 1 and base.appearance.active.opacity is None:
+        said.append(f"opacity {wish.opacity:g} changes nothing: how opaque {base.name} is follows from its amount")
+    if wish.tumbling != 1 and base.wind.flutter == 0:
+        said.append(f"tumbling {wish.tumbling:g} changes nothing: {base.name} does not sway by itself")
+    if wish.accumulates and base.surface.landing != "stays":
+        does = "wets what it hits" if base.surface.landing == "wets" else "flows along surfaces"
+        said.append(f"nothing will gather: {base.name} {does}")
+    return tuple(said)
+
+
+def _base_of(wish: Wish) -> Effect:
+    return EFFECTS[wish.base or "snowfall"]
+
+
+def _enlarges(material: Material) -> bool:
+    """Whether the particles themselves can have any size."""
+    return material.speed_law == "power"
+
+
+def _wanted_intensity(wish: Wish, emission: Emission) -> float:
+    return emission.intensity * wish.amount if emission.precipitates else emission.intensity / wish.amount
+
+
+def _intensity(wish: Wish, emission: Emission) -> float:
+    low, high = INTENSITIES[emission.kind]
+    return min(max(_wanted_intensity(wish, emission), low), high)
+
+
+def _emission(wish: Wish, base: Effect) -> Emission:
+    emission = replace(base.emission, intensity=_intensity(wish, base.emission))
+    if _enlarges(base.material):
+        emission = replace(emission, smallest=emission.smallest * wish.size, largest=emission.largest * wish.size)
+    if emission.most is not None and not emission.precipitates and base.appearance.active.opacity is None:
+        # Opacity of a parcel: its extinction over its area, which cannot go beyond 1. Fewer than the base has would be lumps.
+        denser = base.emission.intensity / emission.intensity
+        emission = replace(emission, most=round(emission.most * max(1.0, denser / wish.size**2)))
+    return emission
+
+
+def _material(wish: Wish, material: Material) -> Material:
+    material = replace(material, speed_factor=material.speed_factor * wish.fall_speed)
+    if not _enlarges(material):
+        return material
+    # Mass and speed at s D are what they were at D.
+    return replace(
+        material,
+        mass_milligram=material.mass_milligram * wish.size**-material.mass_exponent,
+        speed_at_1mm=material.speed_at_1mm * wish.size**-material.speed_exponent,
+    )
+
+
+def _wind(wish: Wish, wind: Wind) -> Wind:
+    return replace(
+        wind,
+        speed=wind.speed * wish.wind,
+        turbulence=wind.turbulence * wish.wind,
+        diffusivity=wind.diffusivity * wish.wind,  # speed times length of the eddies
+        flutter=wind.flutter * wish.tumbling,
+    )
+
+
+def _surface(wish: Wish, surface: SurfaceResponse) -> SurfaceResponse:
+    if not _vanishes(wish, surface):
+        return surface
+    return replace(surface, landing="wets", splash=None, accumulates=False)
+
+
+def _vanishes(wish: Wish, surface: SurfaceResponse) -> bool:
+    """Whether what would stay is wanted gone."""
+    return wish.accumulates is False and surface.landing == "stays"
+
+
+def _appearance(wish: Wish, base: Effect) -> Appearance:
+    looks = base.appearance
+    active, collided = (_look(wish, state) for state in (looks.active, looks.collided))
+    if active.scale_m is None and not _enlarges(base.material):
+        active = replace(active, scale_per_diameter=_times(active.scale_per_diameter, wish.size))
+    active = replace(
+        active,
+        rgb=wish.rgb or active.rgb,
+        tone_spread=_towards(active.tone_spread, GLITTER_TONES, wish.glitter),
+        opacity_spread=_towards(active.opacity_spread, GLITTER_OPACITIES, wish.glitter),
+    )
+    collided = replace(collided, rgb=wish.landed_rgb or collided.rgb)
+    if _vanishes(wish, base.surface):
+        collided = replace(collided, opacity=0.0)
+    return replace(looks, active=active, collided=collided)
+
+
+def _look(wish: Wish, state: StateLook) -> StateLook:
+    """What holds in the air and landed alike."""
+    opacity = None if state.opacity is None else min(state.opacity * wish.opacity, 1.0)
+    scale_m = None if state.scale_m is None else _times(state.scale_m, wish.size)
+    return replace(state, opacity=opacity, scale_m=scale_m)
+
+
+def _times(axes: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    long, short, thin = axes
+    return long * factor, short * factor, thin * factor
+
+
+def _towards(least: float, most: float, share: float) -> float:
+    return least + share * max(most - least, 0.0)
