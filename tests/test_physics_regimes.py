@@ -102,6 +102,12 @@ def test_rain_leaves_all_its_water_on_the_ground():
     assert abs(report(history, RAINFALL.material)["mass_lost"]) < 1e-9
 
 
+def test_what_vanishes_leaves_nothing():
+    history = run(replace(SNOWFALL, surface=replace(SNOWFALL.surface, landing="vanishes")), floor())
+    assert history.about["absorbed"] > 200 and not history.collided.any()
+    assert not any(name.startswith(("water", "cover")) for name in history.about)
+
+
 def air_of(effect: Effect) -> Air:
     sizes = Sizes.of(effect, DOMAIN.volume, 100)
     ground = Ground.of(floor(), effect.surface, DOMAIN)

@@ -115,7 +115,7 @@ TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
         (
             base,
             {"accumulates": False},
-            {"surface.landing": "wets", "surface.accumulates": False, "appearance.collided.opacity": 0.0},
+            {"surface.landing": "vanishes", "surface.accumulates": False, "appearance.collided.opacity": 0.0},
         )
         for base in (SNOWFALL, SANDSTORM)
     ),

@@ -139,7 +139,7 @@ class _Walk:
                 ),
                 Bodies.none(),
             )
-        if response.landing == "wets":
+        if response.landing in ("wets", "vanishes"):
             droplets, share = Bodies.none(), np.zeros(len(touched))
             if response.splash is not None:
                 rng = air.draws(frame, 0x59A5)

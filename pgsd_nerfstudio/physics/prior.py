@@ -94,7 +94,7 @@ def summary(history: ParticleHistory) -> str:
         "slid": "slid",
         "dense": "were dense matter",
         "splashed": "were droplets of splashes",
-        "absorbed": "wetted surfaces",
+        "absorbed": "were absorbed",
     }
     regimes = "".join(f", {about[name]:,} {verb}" for name, verb in ways.items() if about.get(name))
     return (

@@ -44,8 +44,8 @@ def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
     - `fall_speed`: factor of the law of fall speeds. At the same precipitation slower particles are closer together.
     - `wind`: mean wind, turbulence and the eddies below it. Gusts are a share of the mean wind and grow with it.
     - `tumbling`: speed of the swaying at the same rate, so wider circles. What does not sway by itself (all but snow) stays so.
-    - `accumulates`: False lets particles vanish where they land: they are absorbed as rain is, without a splash, raise no
-      cover and have no opacity. True changes nothing: snow and sand gather anyway, rain and fog do not (see `remarks`).
+    - `accumulates`: False lets particles vanish where they land: they raise no cover and have no opacity. True changes nothing:
+      snow and sand gather anyway, rain and fog do not (see `remarks`).
     - `prompt`: as it is. `name` stays that of the base: the paper's physics is looked up by it.
 
     Args:
@@ -137,7 +137,7 @@ def _wind(wish: Wish, wind: Wind) -> Wind:
 def _surface(wish: Wish, surface: SurfaceResponse) -> SurfaceResponse:
     if not _vanishes(wish, surface):
         return surface
-    return replace(surface, landing="wets", splash=None, accumulates=False)
+    return replace(surface, landing="vanishes", splash=None, accumulates=False)
 
 
 def _vanishes(wish: Wish, surface: SurfaceResponse) -> bool:

@@ -1,4 +1,4 @@
-"""What happens where a particle meets a surface: it stays, wets, glides along or splashes."""
+"""What happens where a particle meets a surface: it stays, vanishes, wets, splashes or glides along."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Splash:
 class SurfaceResponse:
     """What happens on contact."""
 
-    landing: Literal["stays", "wets", "glides"] = "stays"
-    """Particles stay and make a cover (snow, sand), leave their water (rain), or flow along the surface (fog)."""
+    landing: Literal["stays", "vanishes", "wets", "glides"] = "stays"
+    """Particles stay and make a cover (snow, sand), are gone, leave their water (rain), or flow along the surface (fog)."""
     holds_degrees: float = 50.0
     """Up to this slope every particle stays."""
     slips_degrees: float = 80.0
