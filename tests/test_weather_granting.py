@@ -23,7 +23,8 @@ from pgsd_nerfstudio.physics.populations import extinction, fall_speed, integral
 from pgsd_nerfstudio.physics.wind import WindField
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL, Effect, InitialLook, initial_look
-from pgsd_nerfstudio.weather.granting import INTENSITIES, granted, remarks
+from pgsd_nerfstudio.weather.granting import granted, remarks
+from pgsd_nerfstudio.weather.matter import INTENSITIES
 from pgsd_nerfstudio.weather.reader import read
 from pgsd_nerfstudio.weather.vocabulary import KINDS
 from pgsd_nerfstudio.weather.wish import BASES, LIMITS, Wish

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from pgsd_nerfstudio.cli.records import Record
-from pgsd_nerfstudio.cli.rows_mpm_costs import costs
 from pgsd_nerfstudio.physics.mpm.experiments import (
     colliding_balls,
     elastic_bar,
@@ -16,7 +15,6 @@ from pgsd_nerfstudio.physics.mpm.experiments import (
 from pgsd_nerfstudio.physics.mpm.experiments_sand import heap_slope, run_out
 from pgsd_nerfstudio.physics.mpm.experiments_water import MARTIN_MOYCE, dam_break, dam_break_in_theory, passage
 
-__all__ = ["cases", "costs"]
 _WALL = "; MPM is a first-order method at walls, whose last half cell is soft"
 
 

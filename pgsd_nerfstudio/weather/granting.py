@@ -14,17 +14,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pgsd_nerfstudio.weather.effect import EFFECTS, Appearance, Effect, StateLook, Wind
-from pgsd_nerfstudio.weather.matter import Emission, Kind, Material
+from pgsd_nerfstudio.weather.matter import INTENSITIES, Emission, Material
 from pgsd_nerfstudio.weather.touch import SurfaceResponse
 from pgsd_nerfstudio.weather.wish import Wish
 
-INTENSITIES: dict[Kind, tuple[float, float]] = {
-    "snowflakes": (0.0, 100.0),
-    "raindrops": (0.1, 200.0),
-    "fog droplets": (5.0, 10_000.0),
-    "sand grains": (5.0, 10_000.0),
-}
-"""Within these an Emission takes its intensity, in its unit."""
 GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
 """Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
 is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the

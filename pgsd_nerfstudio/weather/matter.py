@@ -12,12 +12,15 @@ Array = TypeVar("Array", ndarray, Tensor)
 
 Kind = Literal["snowflakes", "raindrops", "fog droplets", "sand grains"]
 
-_RANGES: dict[str, tuple[float, float, str, str]] = {
+_RANGES: dict[Kind, tuple[float, float, str, str]] = {
     "snowflakes": (0.0, 100.0, "mm/h of water", "heavy snow is about 3"),
     "raindrops": (0.1, 200.0, "mm/h of water", "heavy rain brings 10 to 50"),
     "fog droplets": (5.0, 10_000.0, "m of visibility", "dense fog has less than 200"),
     "sand grains": (5.0, 10_000.0, "m of visibility", "a sandstorm has less than 1000"),
 }
+
+INTENSITIES = {kind: (low, high) for kind, (low, high, _, _) in _RANGES.items()}
+"""Within these an Emission takes its intensity, in its unit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,33 +53,41 @@ def slid(velocity, normal, friction):
 
 
 @ti.func
-def trilinear(rows: ti.template(), position, column, inv_dx, by, bz):
-    """What a column of the nodes says at a position."""
+def cell_at(position, inv_dx, by, bz):
+    """Where in its cell of nodes a position lies, 0-1 on each axis, and the terms of the rows of the cell's corners."""
     at = position * inv_dx
     cell = ti.cast(ti.floor(at), ti.i32)
-    part = at - cell
-    terms = axis_terms(cell + MARGIN, by, bz)
+    return at - cell, axis_terms(cell + MARGIN, by, bz)
+
+
+@ti.func
+def corner(part, terms, q):
+    """Trilinear weight and row of corner q of eight."""
+    i, j, k = q // 4, (q // 2) % 2, q % 2
+    w = ti.abs(1.0 - i - part[0]) * ti.abs(1.0 - j - part[1]) * ti.abs(1.0 - k - part[2])
+    return w, terms[0, i] + terms[1, j] + terms[2, k]
+
+
+@ti.func
+def trilinear(rows: ti.template(), position, column, inv_dx, by, bz):
+    """What a column of the nodes says at a position."""
+    part, terms = cell_at(position, inv_dx, by, bz)
     total = 0.0
     for q in range(8):
-        i, j, k = q // 4, (q // 2) % 2, q % 2
-        w = ti.abs(1.0 - i - part[0]) * ti.abs(1.0 - j - part[1]) * ti.abs(1.0 - k - part[2])
-        total += w * rows[terms[0, i] + terms[1, j] + terms[2, k], column]
+        w, node = corner(part, terms, q)
+        total += w * rows[node, column]
     return total
 
 
 @ti.func
 def wall_at(wall: ti.template(), first, position, inv_dx, by, bz):
     """Distance, normal (of any length) and friction of a part of the obstacle, between nodes."""
-    at = position * inv_dx
-    cell = ti.cast(ti.floor(at), ti.i32)
-    part = at - cell
-    terms = axis_terms(cell + MARGIN, by, bz)
+    part, terms = cell_at(position, inv_dx, by, bz)
     told = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
     for q in range(8):
-        i, j, k = q // 4, (q // 2) % 2, q % 2
-        w = ti.abs(1.0 - i - part[0]) * ti.abs(1.0 - j - part[1]) * ti.abs(1.0 - k - part[2])
+        w, node = corner(part, terms, q)
         for c in ti.static(range(5)):
-            told[c] += w * wall[terms[0, i] + terms[1, j] + terms[2, k], first + c]
+            told[c] += w * wall[node, first + c]
     return told[0], ti.Vector([told[1], told[2], told[3]]), told[4]
 
 
