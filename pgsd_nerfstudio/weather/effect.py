@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from pgsd_nerfstudio.weather.ambience import Ambience
+from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
+from pgsd_nerfstudio.weather.spell import Spell
 from pgsd_nerfstudio.weather.touch import SurfaceResponse
 
 
@@ -87,10 +90,15 @@ class Effect:
     emission: Emission
     material: Material
     wind: Wind = field(default_factory=Wind)
+    spell: Spell = field(default_factory=Spell)
     surface: SurfaceResponse = field(default_factory=SurfaceResponse)
     dense: Dense | None = None
     """What it is where much of it moves together on a surface; None: particles never feel each other."""
     appearance: Appearance = field(default_factory=Appearance)
+    haze: Haze | None = None
+    """What hangs in the air as far as one can see; None: clear air."""
+    ambience: Ambience | None = None
+    """How the light of the whole scene follows; None: it stays as it is."""
     prompt: str
     """What a video model is told; {scene} stands for the description of the scene."""
     negative_prompt: str = ""

@@ -66,6 +66,11 @@ class SurfaceResponse:
     layer_thickness: float = 0.010
     """Thickness in metres of what one particle leaves; its area follows from its volume, so that the cover does not depend on
     how many particles were affordable."""
+    hides: float = 0.004
+    """Thickness in metres of a layer that hides 63 % of what it lies on."""
+    darkens: float = 0.03
+    """Water in mm (kg/m^2) that makes 63 % of a dry surface look wet; pores take up about 0.1 mm until nothing changes any
+    more."""
     splash: Splash | None = None
     """Droplets of an impact; None: none."""
 
@@ -74,6 +79,6 @@ class SurfaceResponse:
             raise ValueError(
                 f"slopes must satisfy 0 <= holds <= slips <= 180, got {self.holds_degrees:g} and {self.slips_degrees:g} degrees"
             )
-        for name in ("accumulation_speedup", "layer_density", "layer_thickness"):
+        for name in ("accumulation_speedup", "layer_density", "layer_thickness", "hides", "darkens"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
