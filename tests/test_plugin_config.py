@@ -1,14 +1,24 @@
 """The flags of ns-train pgsd-weather: where they arrive, what is refused, what a saved config says."""
 
+import json
+import re
+import shlex
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 import tyro
 import yaml
 from plugin_scene import tiny_config, write_scene
+from test_weather_asking import GOOD, keys, needs_library, serving  # noqa: F401
 
 from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig, pgsd_weather
 from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.guide import Guide
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.weather.granting import granted
+from pgsd_nerfstudio.weather.knobs import Knobs
+from pgsd_nerfstudio.weather.reader import read
 
 
 @pytest.fixture
@@ -17,7 +27,9 @@ def scene(tmp_path: Path) -> Path:
 
 
 def parse(*arguments: object) -> WeatherTrainerConfig:
-    return tyro.cli(WeatherTrainerConfig, default=pgsd_weather.config, args=[str(a) for a in arguments])
+    # As ns-train has it: no --flag alone, always --flag True.
+    as_nerfstudio = tyro.conf.FlagConversionOff[WeatherTrainerConfig]
+    return tyro.cli(as_nerfstudio, default=pgsd_weather.config, args=[str(a) for a in arguments])
 
 
 def test_flags_reach_pipeline_data_manager_and_model(scene: Path):
@@ -43,9 +55,11 @@ def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture
         parse("--help")
     shown = capsys.readouterr().out
     assert left.value.code == 0
-    for flag in ("--load-scene", "--data", "--effect", "--prior", "--steps", "--seconds", "--metres-per-unit", "--intensity"):
-        assert shown.count(f"{flag} ") == 1, flag
-    assert "--pipeline" not in shown and "--optimizers" not in shown
+    knobs = [f"--{knob.name.replace('_', '-')}" for knob in fields(Knobs)]
+    for flag in ("--load-scene", "--data", "--prior", "--steps", "--seconds", "--metres-per-unit", *knobs):
+        assert len(re.findall(rf"^│ {flag} ", shown, re.MULTILINE)) == 1, flag
+    assert shown.index("--load-scene") < shown.index("--effect") < shown.index("--prior")
+    assert not any(flag in shown for flag in ("--pipeline", "--optimizers", "--understood"))
 
 
 @pytest.mark.parametrize(
@@ -55,6 +69,11 @@ def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture
         (["--load-scene", "demo", "--data", "nowhere"], "no data at"),
         (["--load-scene", "demo", "--effect", "hail"], "there is no effect 'hail'; known are: "),
         (["--load-scene", "demo", "--intensity", "-1"], "intensity must lie in 0-100 mm/h"),
+        (["--load-scene", "demo", "--size", "9"], "--size must lie in 0.2-5, got 9"),
+        (["--load-scene", "demo", "--color", "purpel"], "got 'purpel'; was 'purple' meant?"),
+        (["--load-scene", "demo", "--weather", "snow", "--effect", "fog"], "--weather stands in place of --effect"),
+        (["--load-scene", "demo", "--weather", "bliss"], "'bliss' names nothing that could be in the air"),
+        (["--load-scene", "demo", "--llm", "openai:x"], "--llm openai:x needs words to ask about"),
         (["--load-scene", "demo", "--seconds", "0"], "--seconds must be positive"),
         (["--load-scene", "demo", "--export-time", "2"], "--export-time must lie in 0-1"),
     ],
@@ -88,3 +107,94 @@ def test_the_config_of_another_version_is_refused_in_a_sentence(scene: Path, tmp
     text = (config.get_base_dir() / "config.yml").read_text().replace(f"version: {config.version}", version)
     with pytest.raises(RunError, match=r"written by pgsd_nerfstudio .* installed is .*train the run again"):
         yaml.load(text, Loader=yaml.Loader)
+
+
+# Words for the weather.
+
+
+def test_words_are_read_once_and_the_saved_config_says_what_they_mean(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    config = tiny_config(scene, Path("prior"), tmp_path / "outputs", intensity=None, weather="heavy purple blorp rain")
+    config.print_to_terminal()
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.count("understood rain = rainfall; heavy = amount 2; purple = colour") == 1 and "Ignored: blorp" in said
+    config.save_config()
+    loaded = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
+    options = loaded.pipeline.options
+    assert options == config.pipeline.options == loaded.options()
+    assert options.chosen_effect() == granted(read("heavy purple blorp rain").wish)
+    # What is kept is what counts, even if words should be read otherwise one day; of other words it says nothing.
+    options.understood["wish"]["size"] = 3.0
+    assert options.chosen_effect() == granted(replace(read("heavy purple blorp rain").wish, size=3.0))
+    assert replace(options, weather="thin fog").chosen_effect() == granted(read("thin fog").wish)
+    assert replace(options, weather=None).chosen_effect() == WeatherOptions(load_scene=scene).chosen_effect()
+
+
+@needs_library
+def test_a_language_model_is_asked_once_for_a_run_and_never_when_it_is_opened(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "cache"))
+    with serving("openai", json.dumps(GOOD)) as server:
+        words = ("--weather", "lilac wonders", "--llm", server.model, "--llm-url", server.url)
+        config = parse("--load-scene", scene, "--data", scene.parent, "--output-dir", tmp_path / "outputs", *words)
+        config.set_timestamp()
+        config.save_config()
+        assert len(server.asked) == 1
+    assert [path.name[:5] for path in (tmp_path / "cache/wishes").iterdir()] == ["wish-"]
+    monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "elsewhere"))
+    text = (config.get_base_dir() / "config.yml").read_text()
+    options = yaml.load(text, Loader=yaml.Loader).pipeline.options
+    assert options.chosen_effect().prompt == GOOD["prompt"]  # and no server listens any more
+    assert options.remarks()[0].startswith("openai:test-model was asked what 'lilac wonders' means: snowfall")
+
+
+def test_the_video_prior_is_told_what_the_words_say_unless_there_is_a_prompt(scene: Path):
+    class Deaf:
+        def encode_prompt(self, texts: list[str]) -> list[str]:
+            return texts
+
+    words = parse("--load-scene", scene, "--data", scene.parent, "--weather", "purple snow").options()
+    assert Guide.listening(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]
+    told = replace(words, prompt="A purple day")
+    assert Guide.listening(Deaf(), told, "a yard").wanted == "A purple day"  # type: ignore[arg-type]
+
+
+# The command that makes a run again.
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [],
+        ["--effect", "fog", "--everything", "True", "--intensity", "100"],
+        ["--weather", "purple snow, 'quoted'", "--amount", "1.5", "--size", "0.1e1", "--accumulation", "False"],
+        ["--wind", "3", "--wind-direction", "-45.5", "--color", "#204060", "--haze", "0.5", "--haze-color", "dusty rose"],
+        ["--onset", "2", "--ends", "8", "--ambience", "False", "--accumulation-speedup", "20", "--exposure", "0.01"],
+        ["--weather-seed", "3", "--seconds", "2", "--fps", "10", "--max-particles", "77", "--metres-per-unit", "2.5"],
+    ],
+)
+def test_the_command_of_a_run_makes_the_same_weather_again(scene: Path, flags: list[str]):
+    config = parse("--load-scene", scene, "--data", scene.parent, *flags)
+    program, method, *words = shlex.split(config.options().command())
+    assert (program, method) == ("ns-train", "pgsd-weather")
+    assert parse(*words).options() == config.options()
+
+
+def test_the_command_names_a_language_model(scene: Path):
+    options = WeatherOptions(load_scene=scene, weather="lilac wonders", llm="openai:x", llm_url="http://127.0.0.1:1/v1")
+    assert "--weather 'lilac wonders' --llm openai:x --llm-url http://127.0.0.1:1/v1" in options.command()
+
+
+def test_a_config_from_before_a_flag_was_added_has_its_default(scene: Path, tmp_path: Path):
+    config = tiny_config(scene, Path("prior"), tmp_path / "outputs")
+    config.save_config()
+    new = {knob.name for knob in fields(Knobs)} - {"effect", "intensity", "exposure"} | {"understood"}
+    text = (config.get_base_dir() / "config.yml").read_text()
+    lines = [line for line in text.splitlines() if line.strip().partition(":")[0] not in new]
+    assert len(text.splitlines()) - len(lines) == 2 * len(new)  # of the trainer and of the options that the three others share
+    loaded = yaml.load("\n".join(lines), Loader=yaml.Loader)
+    assert loaded.options() == loaded.pipeline.options == config.pipeline.options
+    assert loaded.pipeline.options.chosen_effect() == config.pipeline.options.chosen_effect()
+    assert replace(loaded.pipeline.options, size=2.0).size == 2.0

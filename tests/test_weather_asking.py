@@ -336,7 +336,9 @@ def test_without_a_model_the_reader_answers():
 def test_with_a_model_it_answers_and_is_named(tmp_path):
     with serving("openai", json.dumps(GOOD)) as server:
         granted = wish_for("purple snow", model=server.model, base_url=server.url, cache_dir=tmp_path)
-    assert (granted.wish, granted.by, granted.remark) == (WISH, "openai:test-model", "")
+    assert (granted.wish, granted.by) == (WISH, "openai:test-model")
+    said = "openai:test-model was asked what 'purple snow' means: snowfall, rgb (0.50, 0.00, 0.50), glitter 0.3"
+    assert granted.remark == said
 
 
 @needs_library
@@ -348,7 +350,8 @@ def test_the_reader_steps_in_only_if_allowed_and_says_so(tmp_path):
         granted = wish_for("purple snow", **asking, reader_fallback=True)
     assert (granted.wish, granted.by) == (read("purple snow").wish, "reader")
     assert (
-        granted.remark.startswith("openai:test-model refused the key") and "Read without it: understood snow" in granted.remark
+        granted.remark.startswith("openai:test-model refused the key")
+        and "The built-in reader answers instead: understood snow" in granted.remark
     )
 
 

@@ -78,9 +78,18 @@ def _ratio(new: Any, old: Any) -> Any:
     return round(new / old, 9) if isinstance(new, int | float) and old and not isinstance(new, bool) else new
 
 
+def mixed(base: Effect) -> tuple[float, ...]:
+    """Ratios of the haze's colour, 35 % of the way to purple, to its own."""
+    own = base.haze.rgb if base.haze else PURPLE
+    return tuple(round((0.65 * old + 0.35 * new) / old, 9) for old, new in zip(own, PURPLE, strict=True))
+
+
 TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
     *((base, {}, {}) for base in EFFECTS.values()),
-    *((base, {"rgb": PURPLE}, {"appearance.active.rgb": PURPLE}) for base in EFFECTS.values()),
+    *(
+        (base, {"rgb": PURPLE}, {"appearance.active.rgb": PURPLE, "appearance.collided.rgb": PURPLE, "haze.rgb": mixed(base)})
+        for base in EFFECTS.values()
+    ),
     *((base, {"landed_rgb": PURPLE}, {"appearance.collided.rgb": PURPLE}) for base in EFFECTS.values()),
     (
         SNOWFALL,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
+from pgsd_nerfstudio.weather.knobs import Knobs
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,19 +20,35 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.weather import Effect
 
 
-@dataclass(frozen=True, kw_only=True)
-class Preview:
-    """Show a weather in a scene without training: simulated motion, initial look, as an mp4 and a picture beside it."""
+@dataclass(kw_only=True)
+class Simulated:
+    """Which scene, and how the weather in it is simulated; not frozen, since the knobs of a weather are not."""
 
     load_scene: str
     """A splatfacto run (folder, config.yml or .ckpt), a 3DGS .ply (then with --data), or the word demo."""
     data: Path | None = None
     """Folder of transforms.json, or the file; a .ply needs it for its cameras."""
-    effect: str = "snowfall"
-    """Which weather."""
-    weather: str | None = None
-    """The weather in words, such as "purple snow" or "glittering yellow sand"; understood by a built-in reader, in place of
-    --effect."""
+    metres_per_unit: float | None = None
+    """Length of a scene unit in metres; estimated from the cameras' height above the ground if not given."""
+    seconds: float = 10.0
+    """Length of the simulated weather in seconds."""
+    fps: float = 25.0
+    """Frames per second, of the simulation and of what is shown of it."""
+    max_particles: int | None = None
+    """Most particles in the air at once, each standing for several real ones; by default 20,000.
+    A preview with CUDA takes 200,000."""
+    seed: int = 0
+    """Seed of everything random."""
+    physics: Literal["metric", "paper"] = "metric"
+    """metric is right in SI units; paper is the publication's solver and numbers, to compare with."""
+    everything: bool = False
+    """Simulate also the air that no training camera can see."""
+
+
+@dataclass(kw_only=True)
+class Preview(Knobs, Simulated):
+    """Show a weather in a scene without training: simulated motion, initial look, as an mp4 and a picture beside it."""
+
     output: Path = Path("preview.mp4")
     """Where the video goes; its last frame goes beside it as .png."""
     frames: int = 50
@@ -40,29 +57,10 @@ class Preview:
     """Width in pixels."""
     height: int = 360
     """Height in pixels."""
-    fps: float = 25.0
-    """Frames per second, of the video and of the simulation."""
-    seconds: float = 10.0
-    """Length of the simulated weather; it starts with flakes in the air and none on the ground."""
     start: float | None = None
     """First second to show; by default the last ones are shown, when the most has gathered."""
-    intensity: float | None = None
-    """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres; by
-    default the effect's own."""
-    physics: Literal["metric", "paper"] = "metric"
-    """metric is right in SI units; paper is the publication's solver and numbers, to compare with."""
-    everything: bool = False
-    """Simulate also the air that no training camera can see."""
-    exposure: float | None = None
-    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default the effect's own."""
-    max_particles: int | None = None
-    """Most particles in the air at once, each standing for several real ones; by default 20,000, with CUDA 200,000."""
-    seed: int = 0
-    """Seed of everything random."""
     views: tuple[int, int] | None = None
     """Numbers of the two training views between which the camera moves; chosen by itself if not given."""
-    metres_per_unit: float | None = None
-    """Length of a scene unit in metres; estimated from the cameras' height above the ground if not given."""
 
     def run(self) -> int:
         from rich.progress import track
@@ -71,8 +69,8 @@ class Preview:
 
         self._check()
         began = time.perf_counter()
+        effect = effect_told(self, self.output.parent)
         with refusing(ValueError, FileNotFoundError):
-            effect = self._effect()
             say(f"opening {self.load_scene}")
             scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
             cameras = self._cameras(scene)
@@ -104,27 +102,6 @@ class Preview:
             raise Refusal(f"--output must end in .mp4, got {self.output}")
         if self.start is not None and not self.start >= 0:
             raise Refusal(f"--start must not be negative, got {self.start:g} s")
-        if self.weather is not None and self.effect != Preview.effect:
-            raise Refusal(f"--weather stands in place of --effect, got both {self.weather!r} and {self.effect}: leave out one")
-
-    def _effect(self) -> Effect:
-        """The effect of that name, or the one that the words for the weather ask for."""
-        from pgsd_nerfstudio.weather import effect as weather_effect
-
-        if self.weather is None:
-            return weather_effect(self.effect, intensity=self.intensity, exposure=self.exposure)
-        from pgsd_nerfstudio.weather.granting import granted, remarks
-        from pgsd_nerfstudio.weather.reader import read
-
-        reading = read(self.weather)
-        effect, lacks = granted(reading.wish), remarks(reading.wish)
-        if self.intensity is not None:
-            effect = replace(effect, emission=replace(effect.emission, intensity=self.intensity))
-        if self.exposure is not None:
-            effect = replace(effect, appearance=replace(effect.appearance, exposure=self.exposure))
-        for line in (str(reading), *lacks):
-            say(line)
-        return effect
 
     def _make_folder(self) -> None:
         """The folder of the output, before anything costly is done."""
@@ -178,6 +155,18 @@ class Preview:
             return rasterizer.render(cameras[index], weather).rgb[0]
 
         return picture
+
+
+def effect_told(knobs: Knobs, folder: Path) -> Effect:
+    """The effect that the knobs ask for, after all has been said that is to be said about it; `folder` keeps answers."""
+    with refusing(ValueError, OSError):
+        knobs.judge()
+        if knobs.llm is not None:
+            say(f"asking {knobs.llm} what {knobs.weather!r} means")
+        effect, remarks = knobs.effect_asked(folder)
+    for remark in remarks:
+        say(remark)
+    return effect
 
 
 def open_scene(path: str, data: Path | None, metres_per_unit: float | None) -> Scene:

@@ -8,42 +8,20 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from pgsd_nerfstudio.cli.preview import open_scene, say
+from pgsd_nerfstudio.cli.preview import Simulated, effect_told, open_scene, say
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
+from pgsd_nerfstudio.weather.knobs import Knobs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, kw_only=True)
-class Simulate:
+@dataclass(kw_only=True)
+class Simulate(Knobs, Simulated):
     """Simulate a weather in a scene, physics only. Interrupted, it goes on where it was; ns-train finds the result."""
 
-    load_scene: str
-    """A splatfacto run (folder, config.yml or .ckpt), a 3DGS .ply (then with --data), or the word demo."""
-    data: Path | None = None
-    """Folder of transforms.json, or the file; a .ply needs it for its cameras."""
-    effect: str = "snowfall"
-    """Which weather."""
-    intensity: float | None = None
-    """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres; by
-    default the effect's own."""
-    physics: Literal["metric", "paper"] = "metric"
-    """metric is right in SI units; paper is the publication's solver and numbers, to compare with."""
-    everything: bool = False
-    """Simulate also the air that no training camera can see."""
-    seconds: float = 10.0
-    """Length of the weather."""
-    fps: float = 25.0
-    """Frames per second."""
-    max_particles: int | None = None
-    """Most particles in the air at once, each standing for several real ones; by default 20,000."""
-    seed: int = 0
-    """Seed of everything random."""
-    metres_per_unit: float | None = None
-    """Length of a scene unit in metres; estimated from the cameras' height above the ground if not given."""
     output: Path = Path("simulation")
     """Folder for report.json and report.png."""
 
@@ -52,17 +30,16 @@ class Simulate:
         from pgsd_nerfstudio.physics.report import report
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
-        from pgsd_nerfstudio.weather import effect as weather_effect
 
         for name in ("seconds", "fps", "max_particles"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise Refusal(f"--{name.replace('_', '-')} must be positive, got {value:g}")
+        effect = effect_told(self, self.output)
         with refusing(OSError):
             self.output.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
         with refusing(ValueError, FileNotFoundError, OSError):
-            effect = weather_effect(self.effect, intensity=self.intensity)
             scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
             say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
             surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"))

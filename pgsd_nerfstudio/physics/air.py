@@ -1,4 +1,10 @@
-"""The air of a run, and what comes into it: full at the start, then fed through the top and from where the wind blows."""
+"""The air of a run, and what comes into it: there from the start or when the weather arrives, then fed through the top and from
+where the wind blows.
+
+A weather that comes behind a front is steady weather of which only what lies behind the front is there. So in each frame comes
+what was ahead of the front and is behind it now, drawn from steady air; and what the wind carries out ahead of the front ends. The
+air behind it thus holds what steady air does, whether the wind is faster than the front or slower.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.physics.airborne import Flutter, advance
+from pgsd_nerfstudio.physics.arrival import Arrival
 from pgsd_nerfstudio.physics.chunks import Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.contact import Ground
@@ -17,6 +25,8 @@ from pgsd_nerfstudio.physics.sight import Sight
 from pgsd_nerfstudio.physics.wind import WindField
 from pgsd_nerfstudio.weather.effect import Effect
 
+ARRIVING, SHOWN, AHEAD, WALK, WALK_AHEAD = 0xA221, 0x5404, 0xF207, 0xD1FF, 0xD1FA  # purposes of randomness
+
 
 @dataclass(frozen=True)
 class Air:
@@ -25,6 +35,7 @@ class Air:
     domain: Domain
     sizes: Sizes
     wind: WindField
+    arrival: Arrival
     effect: Effect
     ground: Ground
     sight: Sight
@@ -75,30 +86,77 @@ class Air:
             kinds=np.zeros(count, np.uint8),
         )
 
-    def first(self) -> Bodies:
-        """The air of frame 0: as if it had gone on for long, so nothing is below a roof or under the ground."""
-        rng = self.draws(0)
-        positions, diameters = fill(self.sizes, self.domain, rng)
-        speeds = fall_speed(diameters, self.effect.material)
-        new = self.newborn(positions, diameters, self.settled(positions, speeds, 0.0), rng)
-        free = ~self.shadowed(positions, speeds, 0.0)
-        return new.select(free & self.sight.needed(positions))
+    def fly(self, bodies: Bodies, frame: int, purpose: int = WALK) -> None:
+        """Carry particles from the frame before to `frame`, in place; `purpose` is that of their random walk."""
+        flutter = Flutter(bodies.sways, bodies.hertz, bodies.phases)
+        advance(bodies.positions, bodies.velocities, bodies.speeds, flutter, self.wind, (frame - 1) * self.step, self.step)
+        spread = np.sqrt(2 * self.effect.wind.diffusivity * self.step)
+        if spread > 0:
+            walk = self.draws(frame, purpose).normal(scale=spread, size=bodies.positions.shape)
+            bodies.positions[:] += walk.astype(np.float32)
+
+    def arriving(self, frame: int) -> Bodies:
+        """What is in the air in `frame` because the weather has just come to it there; without an onset all, in frame 0."""
+        if (frame - 1) * self.step >= self.effect.spell.onset:
+            return Bodies.none()
+        return self._overtaken(frame) if self.arrival.is_front else self._risen(frame)
 
     def entering(self, gone: Bodies, carry: float, frame: int) -> tuple[Bodies, float]:
-        """New particles: through the top, and opposite to where others (`gone`) left through a side."""
+        """New particles: through the top, opposite to where others (`gone`) left through a side, and where the weather arrives."""
+        if self.arrival.is_over(frame * self.step):
+            return Bodies.none(), carry
         rng, time = self.draws(frame), frame * self.step
         lower, size = np.asarray(self.domain.lower), np.asarray(self.domain.size)
         positions, diameters, share, carry = feed(self.sizes, self.domain, carry, self.step, rng)
         fallen = self.settled(positions, fall_speed(diameters, self.effect.material), time)
         positions = positions + fallen * (share * self.step)[:, None]
         positions[:, :2] = lower[:2] + (positions[:, :2] - lower[:2]) % size[:2]
-        fed = self.newborn(positions, diameters, fallen, rng).select(self.sight.needed(positions))
+        # Each came in at its own time within the step; a front is where it is in this frame.
+        came = time if self.arrival.is_front else time - share * self.step
+        comes = self.arrival.times(positions, self.draws(frame, SHOWN).uniform(size=len(positions))) <= came
+        fed = self.newborn(positions, diameters, fallen, rng).select(comes & self.sight.needed(positions))
+        # Within an onset fewer leave, and so fewer come in: these need no thinning of their own.
+        blown = self._around(gone, time)
+        return Bodies.join([fed, replace(blown, kinds=np.zeros_like(blown.kinds)), self.arriving(frame)]), carry
 
-        inside = (gone.positions[:, 2] >= lower[2]) & (gone.positions[:, 2] <= self.domain.upper[2])
-        wrapped = gone.positions.astype(np.float64)
+    def _risen(self, frame: int) -> Bodies:
+        """Those of the air's first particles that come in `frame`: as if they had been on their way for long, so none is below
+        a roof or under the ground.
+
+        They follow from the seed alone and are drawn anew in each frame, so that nothing has to be kept for a run that goes on.
+        """
+        rng, time = self.draws(0), frame * self.step
+        positions, diameters = fill(self.sizes, self.domain, rng)
+        new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
+        times = self.arrival.times(positions, self.draws(0, ARRIVING).uniform(size=len(positions)))
+        comes = np.ceil(times / self.step).clip(1.0 if self.effect.spell.starts_clear else 0.0) == frame
+        positions, speeds = positions[comes], fall_speed(diameters[comes], self.effect.material)
+        velocities = self.settled(positions, speeds, time).astype(np.float32)
+        new = replace(new.select(comes), velocities=velocities)
+        return new.select(~self.shadowed(positions, speeds, time) & self.sight.needed(positions))
+
+    def _overtaken(self, frame: int) -> Bodies:
+        """What was ahead of the front in the frame before and is behind it in `frame`, also around the sides of the box."""
+        if frame == 0:
+            return Bodies.none()
+        rng, before = self.draws(frame, AHEAD), (frame - 1) * self.step
+        positions, diameters = fill(self.sizes, self.domain, rng)
+        ahead = self.arrival.times(positions) > before
+        positions, diameters = positions[ahead], diameters[ahead]
+        new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
+        # Settled, by the kernel, which is many times faster than `settled`: what hardly falls has at once the air's velocity.
+        weightless, none = np.full(len(new), 1e-9, np.float32), Flutter.none(len(new))
+        advance(new.positions.copy(), new.velocities, weightless, none, self.wind, before, self.step)
+        new.velocities[:, 2] -= new.speeds
+        self.fly(new, frame, WALK_AHEAD)
+        return self._around(new, frame * self.step)
+
+    def _around(self, bodies: Bodies, time: float) -> Bodies:
+        """Particles put where they are in a box that goes on at its opposite side; those that can be there, and are needed."""
+        lower, size = np.asarray(self.domain.lower), np.asarray(self.domain.size)
+        inside = (bodies.positions[:, 2] >= lower[2]) & (bodies.positions[:, 2] <= self.domain.upper[2])
+        wrapped = bodies.positions.astype(np.float64)
         wrapped[:, :2] = lower[:2] + (wrapped[:, :2] - lower[:2]) % size[:2]
-        inside &= self.sight.needed(wrapped)
-        inside[inside] = ~self.shadowed(wrapped[inside], gone.speeds[inside], time)
-        again = gone.select(inside)
-        blown = replace(again, positions=wrapped[inside].astype(np.float32), kinds=np.zeros_like(again.kinds))
-        return Bodies.join([fed, blown]), carry
+        inside &= self.sight.needed(wrapped) & self.arrival.passed(wrapped, time)
+        inside[inside] = ~self.shadowed(wrapped[inside], bodies.speeds[inside], time)
+        return replace(bodies.select(inside), positions=wrapped[inside].astype(np.float32))

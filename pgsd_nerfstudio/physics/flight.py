@@ -8,7 +8,6 @@ import numpy as np
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.air import Air
-from pgsd_nerfstudio.physics.airborne import Flutter, advance
 from pgsd_nerfstudio.physics.chunks import ABSORBED, DENSE, LEFT, SLID, UNSEEN, Bodies, Chunk, State
 from pgsd_nerfstudio.physics.contact import Meeting
 from pgsd_nerfstudio.physics.deposits import Deposits
@@ -45,14 +44,14 @@ class _Walk:
         return State(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born, self.carry)
 
     def begin(self) -> None:
-        """Frame 0: the air is full."""
-        self.flying = self.log.enter(self.air.first(), 0)
+        """Frame 0: what is in the air from the start."""
+        self.flying = self.log.enter(self.air.arriving(0), 0)
 
     def advance(self, frame: int) -> None:
         """From the frame before to `frame`."""
         air, log = self.air, self.log
         before = self.flying.positions.copy()
-        self._fly(frame)
+        air.fly(self.flying, frame)
         meeting = air.ground.meet(before, self.flying.positions, self.deposits.cover)
         self.flying.positions[meeting.which] = meeting.points
         aloft, gone = self._leave(meeting, frame)
@@ -68,27 +67,23 @@ class _Walk:
         for bodies in (self.flying, self.sliding, self.dense):
             _check(bodies, frame)
 
-    def _fly(self, frame: int) -> None:
-        air, bodies = self.air, self.flying
-        flutter = Flutter(bodies.sways, bodies.hertz, bodies.phases)
-        advance(bodies.positions, bodies.velocities, bodies.speeds, flutter, air.wind, (frame - 1) * air.step, air.step)
-        spread = np.sqrt(2 * air.effect.wind.diffusivity * air.step)
-        if spread > 0:
-            walk = air.draws(frame, 0xD1FF).normal(scale=spread, size=bodies.positions.shape)
-            bodies.positions[:] += walk.astype(np.float32)
-
     def _leave(self, meeting: Meeting, frame: int) -> tuple[Bodies, Bodies]:
-        """What stays in the air untouched, and what left the box of air; what no camera can see any more ends too."""
+        """What stays in the air untouched, and what left the box of air.
+
+        What no camera can see any more ends too, and what flew out ahead of the weather's front.
+        """
         air, bodies, log = self.air, self.flying, self.log
         lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
         out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
         touched = np.zeros(len(bodies), bool)
         touched[meeting.which] = True
-        unseen = ~touched & ~out & ~air.sight.needed(bodies.positions)
+        ahead = ~touched & ~out & ~air.arrival.passed(bodies.positions, frame * air.step)
+        unseen = ~(touched | out | ahead) & ~air.sight.needed(bodies.positions)
         gone = bodies.select(out & ~touched)
         log.end(gone, frame, LEFT)
+        log.end(bodies.select(ahead), frame, LEFT)
         log.end(bodies.select(unseen), frame, UNSEEN)
-        return bodies.select(~(touched | out | unseen)), gone
+        return bodies.select(~(touched | out | ahead | unseen)), gone
 
     def _slide(self, frame: int) -> Bodies:
         """Move sliders; returns those that fly again. Those that found rest lie down."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 Profile = Literal["metric", "paper"]
-_REVISION = 2  # of what is computed; a stored history of another revision is not used
+_REVISION = 3  # of what is computed; a stored history of another revision is not used
 
 
 def motion_prior(
@@ -49,7 +49,7 @@ def motion_prior(
     domain = domain_of(scene)
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
     cameras = None if everything else scene.frame.cameras_to_metric(scene.cameras)
-    parts = (effect.emission, effect.material, effect.wind, effect.surface, effect.dense)
+    parts = (effect.emission, effect.material, effect.wind, effect.spell, effect.surface, effect.dense)
     what = (surface.vertices, surface.triangles, effect.name, *parts, clock, domain, seed, max_particles, cameras)
     key = content_key("motion prior", _REVISION, profile, *what)
     stored, folder = cache_dir() / "motion" / f"{key}.safetensors", cache_dir() / "motion" / key

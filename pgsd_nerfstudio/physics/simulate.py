@@ -1,4 +1,4 @@
-"""Weather simulated in the air around a scene, from full air at frame 0 to the last frame.
+"""Weather simulated in the air around a scene, from frame 0 to the last: its air is full at once or as its spell has it.
 
 Frames are simulated in chunks. A chunk is a pure function of the state at its start, and the randomness of a frame comes from
 the seed and the number of the frame alone; so an interrupted run goes on from its last stored chunk and ends with the same
@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from pgsd_nerfstudio.physics.air import Air
+from pgsd_nerfstudio.physics.arrival import Arrival
 from pgsd_nerfstudio.physics.chunks import Chunk, State, assemble, load_chunk, save_chunk
 from pgsd_nerfstudio.physics.clock import Clock, Domain
 from pgsd_nerfstudio.physics.contact import Ground
@@ -82,6 +83,7 @@ def simulate(
             domain=domain,
             sizes=Sizes.of(effect, domain.volume, min(max_particles, effect.emission.most or max_particles)),
             wind=WindField.draw(effect.wind, seed, Deflection.of(surface, domain, effect.wind)),
+            arrival=Arrival.of(effect.spell, domain, effect.wind),
             effect=effect,
             ground=Ground.of(surface, effect.surface, domain),
             sight=_sight(effect, domain, cameras),

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.rendering.moment import Moment
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
@@ -67,11 +68,15 @@ def _inside(stage: Stage, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool
 
 
 def render_clip(
-    stage: Stage, cameras: Cameras, weather: Sequence[Gaussians], background: Float[Tensor, "3"]
+    stage: Stage,
+    cameras: Cameras,
+    weather: Sequence[Gaussians],
+    background: Float[Tensor, "3"],
+    moments: Sequence[Moment | None],
 ) -> Float[Tensor, "t 3 h w"]:
     """The clip in 0..1, without a graph."""
     with torch.no_grad():
-        return stage.clip_rasterizer.render(cameras, weather, background).rgb.permute(0, 3, 1, 2).clamp(0, 1)
+        return stage.clip_rasterizer.render(cameras, weather, background, moments).rgb.permute(0, 3, 1, 2).clamp(0, 1)
 
 
 def surrogate(
@@ -79,6 +84,7 @@ def surrogate(
     cameras: Cameras,
     weather: Sequence[Gaussians],  # one set a frame, with the graph of the roll-out
     background: Float[Tensor, "3"],
+    moments: Sequence[Moment | None],
     gradient: Float[Tensor, "t 3 h w"],  # of the loss with respect to the clip
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
     """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians."""
@@ -91,7 +97,7 @@ def surrogate(
         if not names:
             continue
         leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
-        picture = stage.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background).rgb[0]
+        picture = stage.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background, moments[k]).rgb[0]
         found = torch.autograd.grad(picture, list(leaves.values()), gradient[k].permute(1, 2, 0), allow_unused=True)
         for name, on_leaf in zip(names, found, strict=True):
             if on_leaf is not None:

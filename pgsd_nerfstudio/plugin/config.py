@@ -16,6 +16,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import CosineDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from rich.console import Console
 
 from pgsd_nerfstudio.plugin.environment import prepare
 from pgsd_nerfstudio.plugin.options import CUDA, WeatherOptions, check_version
@@ -33,7 +34,7 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
     data: Path | None = None
     """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
     prompt: str | None = None
-    """What the video prior is told; by default the effect's own prompt with the scene's description in it."""
+    """What the video prior is told; by default the effect's own prompt, or that of --weather, with the scene's description."""
     method_name: str | None = "pgsd-weather"
     """Method name."""
     machine: MachineConfig = field(default_factory=lambda: MachineConfig(device_type="cuda" if CUDA else "cpu"))
@@ -67,7 +68,10 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
             self.load_scene = Path(self.load_scene).expanduser().resolve()
         if self.data is not None:
             self.data = Path(self.data).expanduser().resolve()
+        if self.llm is not None and self.weather is not None:
+            _say(f"asking {self.llm} what {self.weather!r} means")
         self.check()
+        self.understand()
         if self.experiment_name is None:
             self.experiment_name = self.load_scene.stem
         self.max_num_iterations, self.training_seed = self.steps, self.machine.seed
@@ -85,7 +89,10 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
         return WeatherOptions(**{f.name: getattr(self, f.name) for f in fields(WeatherOptions)})
 
     def print_to_terminal(self) -> None:
-        """Not all of nerfstudio's fields: what matters is printed as a table once it is settled, the rest is in config.yml."""
+        """Not all of nerfstudio's fields: what matters is printed as a table once it is settled, the rest is in config.yml.
+        Only how the words for the weather were read is said at once, so that a misunderstanding costs nothing."""
+        for remark in self.remarks():
+            _say(remark)
 
     def save_config(self) -> None:
         """As nerfstudio, but the pipeline is told first where the run lies."""
@@ -98,6 +105,10 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
         self.__dict__.update(state)
         if self.load_scene is not tyro.MISSING:
             self.pipeline.run_folder = self.get_base_dir().resolve()
+
+
+def _say(line: str) -> None:
+    Console(stderr=True, highlight=False).print(line, style="dim", markup=False)
 
 
 pgsd_weather = MethodSpecification(

@@ -31,6 +31,7 @@ from pgsd_nerfstudio.plugin.splat import splat_tensors
 from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
+from pgsd_nerfstudio.response.answer import Answer, Shown, baked
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import initial_look
@@ -52,9 +53,12 @@ class WeatherModel(SplatfactoModel):
 
     config: WeatherModelConfig
 
-    def __init__(self, *args: Any, stage: Stage, history: ParticleHistory, exporting: bool = False, **kwargs: Any) -> None:
-        """`stage` and `history` stay outside of the module's state; `exporting`: `gauss_params` are asked for in earnest."""
-        self.stage, self.history, self.exporting = stage, history, exporting
+    def __init__(
+        self, *args: Any, stage: Stage, history: ParticleHistory, answer: Answer, exporting: bool = False, **kwargs: Any
+    ) -> None:
+        """`stage`, `history` and `answer` stay outside of the module's state; `exporting`: `gauss_params` are asked for in
+        earnest."""
+        self.stage, self.history, self.answer, self.exporting = stage, history, answer, exporting
         super().__init__(*args, **kwargs)
 
     def populate_modules(self) -> None:
@@ -69,7 +73,7 @@ class WeatherModel(SplatfactoModel):
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
         self._untimed = 0
-        self._cropped: tuple[Any, Rasterizer] | None = None
+        self._cropped: tuple[Any, Tensor, Rasterizer] | None = None
         self._exported: dict[str, Tensor] | None = None
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
@@ -96,6 +100,10 @@ class WeatherModel(SplatfactoModel):
         with torch.no_grad(), uninterrupted():
             return self.stage.scene.frame.gaussians_to_scene(self.rollout.gaussians(frame))
 
+    def moment(self, frame: int, answer: Answer | None = None) -> Shown | None:
+        """How the frozen scene looks at a frame; None: as it was trained."""
+        return (answer or self.answer).at(frame / self.history.fps)
+
     def frame_at(self, time: float) -> int:
         """The frame nearest to a time 0..1."""
         return round(min(max(time, 0.0), 1.0) * (self.history.frames - 1))
@@ -112,30 +120,40 @@ class WeatherModel(SplatfactoModel):
             self._untimed += 1
         else:
             frame = self.frame_at(float(camera.times.reshape(-1)[0]))
-        return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame)), obb_box))
+        answer = self.weather.adjusted_answer(self.answer)
+        return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame)), obb_box, answer, frame))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Tensor]:
         if not isinstance(ray_bundle, NerfstudioCameras):
             raise RunError("the weather is rasterized: it has no answer for single rays")
         return self.get_outputs_for_camera(ray_bundle)
 
-    def render(self, views: Cameras, weather: Gaussians | None, box: OrientedBox | None = None) -> Rendering:
-        """One view of the scene with some weather or none; without gradient."""
+    def render(
+        self,
+        views: Cameras,
+        weather: Gaussians | None,
+        box: OrientedBox | None = None,
+        answer: Answer | None = None,
+        frame: int = 0,
+    ) -> Rendering:
+        """One view of the scene with some weather or none, and with its answer at a frame or as it was trained; no gradient."""
         rasterizer = self.stage.rasterizer
         with torch.no_grad(), uninterrupted():
             if box is not None:
-                rasterizer = self._inside(box)
+                inside, rasterizer = self._inside(box)
                 weather = None if weather is None else weather.select(box.within(weather.means).reshape(-1))
-            return rasterizer.render(views, weather, self.background_color.to(self.device))
+                answer = None if answer is None else answer.select(inside)
+            moment = None if answer is None else self.moment(frame, answer)
+            return rasterizer.render(views, weather, self.background_color.to(self.device), moment)
 
-    def _inside(self, box: OrientedBox) -> Rasterizer:
-        """The rasterizer of the part of the frozen scene in the viewer's crop box, the last one kept."""
+    def _inside(self, box: OrientedBox) -> tuple[Tensor, Rasterizer]:
+        """Which of the frozen scene lies in the viewer's crop box, and its rasterizer; the last one is kept."""
         key = [tuple(t.flatten().tolist()) for t in (box.R, box.T, box.S)]
         if self._cropped is None or self._cropped[0] != key:
             frozen = self.stage.rasterizer.frozen
             inside = box.within(frozen.means).reshape(-1)
-            self._cropped = (key, choose_rasterizer(frozen.select(inside), self.device))
-        return self._cropped[1]
+            self._cropped = (key, inside, choose_rasterizer(frozen.select(inside), self.device))
+        return self._cropped[1:]
 
     def _outputs(self, rendering: Rendering) -> dict[str, Tensor]:
         rgb = rendering.rgb[0].clamp(0, 1)
@@ -154,8 +172,11 @@ class WeatherModel(SplatfactoModel):
         """
         if self._exported is None:
             frame = self.frame_at(self.config.options.export_time)
-            weather = self.weather_at(frame).to("cpu") if self.exporting else Gaussians.empty()
-            self._exported = splat_tensors(self.stage.scene.gaussians, weather)
+            frozen, weather = self.stage.scene.gaussians, Gaussians.empty()
+            if self.exporting:
+                weather = self.weather_at(frame).to("cpu")
+                frozen = baked(self.moment(frame), frozen.to(self.device)).to("cpu")
+            self._exported = splat_tensors(frozen, weather)
         return self._exported
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:

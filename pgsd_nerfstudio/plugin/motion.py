@@ -1,4 +1,5 @@
-"""The motion prior of a run: prepared once under the Trainer, kept with the run, only ever read afterwards.
+"""The motion prior of a run and the scene's answer to the weather: prepared once under the Trainer, kept with the run, only
+ever read afterwards.
 
 The metric frame is kept with it: trajectories are in metres, and where the ground lies must not change with a later version's
 way of estimating it.
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -17,14 +18,25 @@ from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.response.answer import Answer
+from pgsd_nerfstudio.response.prepare import answer_of, save_answer, stored_answer
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import content_key
 
 FILE = "motion_prior.safetensors"
+ANSWER_FILE = "answer.safetensors"
 
 
-def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | None) -> tuple[Stage, ParticleHistory]:
+class Weather(NamedTuple):
+    """What a run is made of."""
+
+    stage: Stage
+    history: ParticleHistory
+    answer: Answer
+
+
+def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | None) -> Weather:
     """Surface and motion prior (both cached by content), with a copy beside the run's config.yml so that it stands alone.
 
     Raises:
@@ -49,14 +61,16 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
         )
         made_for = {"splat": _splat_key(stage.scene), "frame": _written(stage.scene.frame)}
         history = replace(history, about={**history.about, **made_for})
+        answer = answer_of(stage.scene, surface, effect, seconds=options.seconds, seed=options.weather_seed)
         if run_folder is not None:
             history.save(run_folder / FILE)
+            save_answer(run_folder / ANSWER_FILE, answer)
     except (OSError, ValueError) as error:
         raise RunError(f"the motion prior could not be made: {error}") from error
-    return stage, history
+    return Weather(stage, history, answer)
 
 
-def stored_motion(stage: Stage, options: WeatherOptions, run_folder: Path | None) -> tuple[Stage, ParticleHistory]:
+def stored_motion(stage: Stage, options: WeatherOptions, run_folder: Path | None) -> Weather:
     """The motion prior that a run was trained with, and the stage in the metric frame it was made in; nothing is simulated.
 
     Raises:
@@ -71,7 +85,12 @@ def stored_motion(stage: Stage, options: WeatherOptions, run_folder: Path | None
             f"{options.load_scene} is not the scene this run was trained on (its Gaussians or cameras have changed): "
             f"put the former one back, or train again with: {options.command()}"
         )
-    return replace(stage, scene=replace(stage.scene, frame=_read(history.about["frame"]))), history
+    scene = replace(stage.scene, frame=_read(history.about["frame"]))
+    kept, effect = (run_folder or Path()) / ANSWER_FILE, options.chosen_effect()
+    answer = stored_answer(kept, scene, effect, seconds=options.seconds, seed=options.weather_seed)
+    if answer is None:
+        raise RunError(f"the scene's answer {kept} is missing or damaged, make it again with: {options.command()}")
+    return Weather(replace(stage, scene=scene), history, answer)
 
 
 def _splat_key(scene: Scene) -> str:

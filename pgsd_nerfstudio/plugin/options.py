@@ -6,24 +6,30 @@ minutes, with CUDA it follows the paper.
 
 from __future__ import annotations
 
+import json
 import shlex
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
 
 from pgsd_nerfstudio import __version__
 from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.weather.asking import Granted
 from pgsd_nerfstudio.weather.effect import Effect
+from pgsd_nerfstudio.weather.knobs import Knobs
+from pgsd_nerfstudio.weather.wish import Wish
 
 CUDA = torch.cuda.is_available()
 
 
 @dataclass
-class WeatherOptions:
-    """One weather for one scene, and how it is learned."""
+class SceneOptions:
+    """Which scene, and what it is called and measures."""
 
     load_scene: Path = tyro.MISSING
     """The frozen scene: a splatfacto run folder, its config.yml, a .ckpt, a 3DGS .ply (with --data), or the word demo."""
@@ -33,14 +39,12 @@ class WeatherOptions:
     """What the prompt calls the scene, such as "a garden with a table"; by default made from the scene's name."""
     metres_per_unit: float | None = None
     """Length of one scene unit in metres; by default such that the cameras were held 1.5 m above the ground."""
-    effect: str = "snowfall"
-    """Which weather."""
-    intensity: float | None = None
-    """How much: snow and rain in mm/h of liquid water (heavy snow 3, heavy rain 20), fog and sand as visibility in metres
-    (dense fog 60); by default what the effect says."""
-    exposure: float | None = None
-    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02); by default what the effect
-    says, which for snow is 0, no motion blur."""
+
+
+@dataclass
+class WeatherOptions(Knobs, SceneOptions):
+    """One weather for one scene, and how it is learned."""
+
     seconds: float = 10.0
     """Length of the weather in seconds."""
     fps: float = 25.0
@@ -58,7 +62,7 @@ class WeatherOptions:
     """The video prior: bundled (small, knows only clips like the demo's), a diffusers CogVideoX folder, or a hub id such as
     THUDM/CogVideoX-2b."""
     prompt: str | None = None
-    """What the video prior is told; by default the effect's own prompt with the scene's description in it."""
+    """What the video prior is told; by default the effect's own prompt, or that of --weather, with the scene's description."""
     negative_prompt: str | None = None
     """What the video prior is told to keep away from; by default the effect's own."""
     steps: int = 1000 if CUDA else 60
@@ -90,6 +94,8 @@ class WeatherOptions:
     """Width of a training clip in pixels; by default what the video prior was made for."""
     export_time: float = 1.0
     """The moment that ns-export gaussian-splat writes, from 0 (start of the weather) to 1 (its end)."""
+    understood: tyro.conf.Suppress[dict[str, Any] | None] = None
+    """What the words of --weather were taken for when the run was configured: who opens it later asks nobody."""
     training_seed: tyro.conf.Suppress[int] = 42
     """--machine.seed, for those who do not see the machine's configuration."""
     version: tyro.conf.Suppress[str] = __version__
@@ -134,39 +140,68 @@ class WeatherOptions:
         self.chosen_effect()
 
     def chosen_effect(self) -> Effect:
-        """The effect with the chosen intensity and exposure.
+        """The effect with all knobs turned; words were read when the run was configured, and mean the same ever after.
 
         Raises:
-            RunError: there is no such effect, or a number is out of its range.
+            RunError: there is no such effect, or a knob cannot be used.
         """
-        from pgsd_nerfstudio.weather import effect
+        return self._effect_and_remarks()[0]
 
-        try:
-            return effect(self.effect, intensity=self.intensity, exposure=self.exposure)
-        except ValueError as error:
-            raise RunError(str(error)) from error
+    def remarks(self) -> list[str]:
+        """How the words for the weather were read, and what cannot be granted; raises as `chosen_effect`."""
+        return self._effect_and_remarks()[1]
+
+    def understand(self) -> None:
+        """Keep with the options what the words for the weather mean, so that the run's config.yml says it.
+
+        Raises:
+            RunError: they name nothing that could be in the air, or an answer cannot be kept in the cache.
+        """
+        with _refusing():
+            asked = self.asked()
+        if asked is None:
+            self.understood = None
+            return
+        self.understood = {
+            **self._words(),
+            "by": asked.by,
+            "remark": asked.remark,
+            "wish": json.loads(asked.wish.to_json()),
+        }
+
+    def _effect_and_remarks(self) -> tuple[Effect, list[str]]:
+        with _refusing():
+            return self.turned(self._understood() or self.asked())
+
+    def _understood(self) -> Granted | None:
+        """What is kept, if it is of the same words and reader."""
+        kept = self.understood
+        if kept is None or any(kept.get(name) != value for name, value in self._words().items()):
+            return None
+        return Granted(wish=Wish.from_json(json.dumps(kept["wish"])), by=kept["by"], remark=kept["remark"])
+
+    def _words(self) -> dict[str, str | None]:
+        return {name: getattr(self, name) for name in ("weather", "llm", "llm_url")}
 
     def command(self) -> str:
         """The ns-train command that makes this run's motion prior again."""
         words = ["ns-train", "pgsd-weather"]
-        for name in (
-            "load_scene",
-            "data",
-            "metres_per_unit",
-            "effect",
-            "intensity",
-            "seconds",
-            "fps",
-            "max_particles",
-            "physics",
-            "weather_seed",
-        ):
+        turned = [knob.name for knob in fields(Knobs) if getattr(self, knob.name) != knob.default]
+        simulated = ["seconds", "fps", "max_particles", "physics", "everything", "weather_seed"]
+        for name in ("load_scene", "data", "metres_per_unit", *turned, *simulated):
             value = getattr(self, name)
             if value is not None:
                 words += [f"--{name.replace('_', '-')}", str(value)]
-        if self.everything:
-            words.append("--everything")
         return shlex.join(words)
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """What the weather refuses, as an error of the run."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise RunError(str(error)) from error
 
 
 def check_version(found: str | None) -> None:

@@ -1,4 +1,4 @@
-"""The viewer's knobs: play, snow on and off, size and opacity of the flakes; and where its visitors start from.
+"""The viewer's knobs: play, weather and surfaces on and off, haze, size and opacity of particles; where visitors start from.
 
 Nothing here is saved or learned.
 """
@@ -16,6 +16,7 @@ from typing import Any
 from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerCheckbox, ViewerControl, ViewerSlider
 from torch import nn
 
+from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 
@@ -34,7 +35,10 @@ class Panel(nn.Module):
         self.size = ViewerSlider("Flake size", 1.0, 0.25, 4.0, 0.05, hint="Times the learned size")
         self.speed = ViewerSlider("Speed", 1.0, 0.1, 4.0, 0.1, hint="Seconds of weather per second")
         self.visibility = ViewerSlider("Flake opacity", 1.0, 0.0, 1.0, 0.05, hint="Times the learned opacity")
+        self.surfaces = ViewerCheckbox("Surfaces and light", True, hint="Off: the scene stays as dry, bare and bright as it is")
+        self.haze = ViewerSlider("Haze", 1.0, 0.0, 4.0, 0.1, hint="Times the extinction of fog, dust or rain in the air")
         self.control = Entrance(scene)
+        self._thicker: tuple[int, float, Answer] | None = None
         self._playing = threading.Event()
         self._player: threading.Thread | None = None
 
@@ -45,6 +49,14 @@ class Panel(nn.Module):
         if self.size.value == 1.0 and self.visibility.value == 1.0:
             return weather
         return replace(weather, scales=weather.scales * self.size.value, opacities=weather.opacities * self.visibility.value)
+
+    def adjusted_answer(self, answer: Answer) -> Answer | None:
+        """The scene's answer as the knobs want it; None where it stays as it was trained."""
+        if not (self.shown.value and self.surfaces.value):
+            return None
+        if self._thicker is None or self._thicker[:2] != (answer.number, self.haze.value):
+            self._thicker = answer.number, self.haze.value, answer.thicker(self.haze.value)
+        return self._thicker[2]
 
     def _toggle(self, _: ViewerButton) -> None:
         if self._playing.is_set():

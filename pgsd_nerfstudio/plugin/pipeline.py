@@ -90,12 +90,13 @@ class WeatherPipeline(VanillaPipeline):
             device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
         )
         found = stored_motion if prior is None else prepare_motion
-        stage, history = found(self.datamanager.stage, config.options, config.run_folder)
+        stage, history, answer = found(self.datamanager.stage, config.options, config.run_folder)
         self._model = config.model.setup(
             scene_box=self.datamanager.train_dataset.scene_box,
             num_train_data=len(self.datamanager.train_dataset),
             stage=stage,
             history=history.to(device),
+            answer=answer.to(device),
             exporting=test_mode == "inference",
         )
         self._model.to(device)
@@ -135,13 +136,15 @@ class WeatherPipeline(VanillaPipeline):
             rolled = model.rollout.window(start, len(views), visible=seen)
             weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
-            clip = render_clip(stage, views, weather, background)
+            moments = [model.moment(start + k) for k in range(len(views))]
+            clip = render_clip(stage, views, weather, background, moments)
         if stage.clip_rasterizer is not stage.rasterizer and not self._layers_judged:
-            self._judge_layers(clip, render_clip(replace(stage, clip_rasterizer=stage.rasterizer), views, weather, background))
+            exact = replace(stage, clip_rasterizer=stage.rasterizer)
+            self._judge_layers(clip, render_clip(exact, views, weather, background, moments))
         with watch("video prior"):
             distilled = self._distilled(clip, step)
         with watch("render, backward"):
-            video, norms = surrogate(stage, views, weather, background, distilled.gradient)
+            video, norms = surrogate(stage, views, weather, background, moments, distilled.gradient)
         with watch("regularize"):
             terms = regularization(rolled, model.look)
             scale = regularization_scale(options.weights, distilled.loss)

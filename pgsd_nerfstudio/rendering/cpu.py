@@ -17,6 +17,7 @@ from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.layers_walk import blend_layered, blend_layered_backward
+from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
@@ -58,21 +59,31 @@ class CpuRasterizer:
         """As `Rasterizer.memory`."""
         return str(self.views)
 
-    def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
+    def render(
+        self,
+        cameras: Cameras,
+        dynamic: Dynamic = None,
+        background: Float[Tensor, "3"] | None = None,
+        moments: Moments = None,
+    ) -> Rendering:
         """As `Rasterizer.render`."""
         if not (torch.isfinite(cameras.viewmats).all() and torch.isfinite(cameras.Ks).all()):
             raise ValueError("the cameras' viewmats and Ks must be finite, found NaN or infinite values")
+        at = moment_per_frame(moments, len(cameras))
         frames = []
-        for k, moving in enumerate(dynamic_per_frame(dynamic, len(cameras))):
-            view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height)
+        for k, (moving, moment) in enumerate(zip(dynamic_per_frame(dynamic, len(cameras)), at, strict=True)):
+            view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height, moment)
             if moving is None:
                 frames.append(torch.from_numpy(frozen.image))
             else:
                 colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
+                if moment is not None:
+                    colors = moment.moving_colors(colors, moving.means, Viewpoint.of(cameras, k, moving.means))
                 tensors = {**moving.tensors, "colors": colors}
                 frames.append(_RenderMerged.apply(view, frozen, self.config, *tensors.values()))
         clip = torch.stack(frames)
-        return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], background)
+        behind = backgrounds(background, cameras, at, clip)
+        return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], behind)
 
 
 class _Walk(NamedTuple):

@@ -7,7 +7,7 @@ and merged with the frozen scene's list. The picture is the same.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,21 +18,13 @@ from torch import Tensor
 
 from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
 from pgsd_nerfstudio.rendering.isects import Isects, merge
+from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-
-
-class View(NamedTuple):
-    """One camera, on the device."""
-
-    viewmat: Float[Tensor, "4 4"]
-    K: Float[Tensor, "3 3"]
-    width: int
-    height: int
 
 
 class Splats(NamedTuple):
@@ -89,44 +81,63 @@ class GsplatRasterizer:
         """As `Rasterizer.memory`."""
         return str(self.views)
 
-    def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
+    def render(
+        self,
+        cameras: Cameras,
+        dynamic: Dynamic = None,
+        background: Float[Tensor, "3"] | None = None,
+        moments: Moments = None,
+    ) -> Rendering:
         """As `Rasterizer.render`."""
-        frames = [self._frame(cameras, k, moving) for k, moving in enumerate(dynamic_per_frame(dynamic, len(cameras)))]
-        clip = torch.stack(frames)
-        return composite(clip[..., :3], clip[..., 3], clip[..., 4], background)
+        at = moment_per_frame(moments, len(cameras))
+        moving = dynamic_per_frame(dynamic, len(cameras))
+        clip = torch.stack([self._frame(cameras, k, moving[k], at[k]) for k in range(len(cameras))])
+        behind = backgrounds(background, cameras, at, clip)
+        return composite(clip[..., :3], clip[..., 3], clip[..., 4], behind)
 
     @staticmethod
     def _check_device(frozen: Gaussians) -> None:
         if frozen.device.type != "cuda":
             raise ValueError(f"GsplatRasterizer expects Gaussians on CUDA, found them on {frozen.device}; call .to('cuda')")
 
-    def _frame(self, cameras: Cameras, k: int, moving: Gaussians | None) -> Float[Tensor, "h w 5"]:
+    def _frame(self, cameras: Cameras, k: int, moving: Gaussians | None, moment: Moment | None) -> Float[Tensor, "h w 5"]:
         """Sums along the rays: red, green, blue, weighted depth, accumulation."""
-        viewmat, K = (t[k].to(self.frozen.device, torch.float32) for t in (cameras.viewmats, cameras.Ks))
-        view = View(viewmat, K, cameras.width, cameras.height)
+        view = Viewpoint.of(cameras, k, self.frozen.means)
         # The key is made of what the caller holds, mostly on the CPU: the device need not be waited for.
-        scene = self.views.get(cameras.viewmats[k], cameras.Ks[k], view.width, view.height, lambda: self._prepare(view))
+        key = b"" if moment is None else moment.key
+        scene = self.views.get(
+            cameras.viewmats[k], cameras.Ks[k], view.width, view.height, lambda: self._prepare(view, moment), key
+        )
         if moving is None:
             return _blend(scene, view)
-        movers = self._sort(moving.to(self.frozen.device, torch.float32), view)
+
+        def arriving(rgb: Tensor, means: Tensor, ids: Tensor) -> Tensor:
+            return rgb if moment is None else moment.moving_colors(rgb, means, view)
+
+        movers = self._sort(moving.to(self.frozen.device, torch.float32), view, arriving)
         splats = Splats(*(torch.cat(pair) for pair in zip(scene.splats, movers.splats, strict=True)))
         return _blend(Sorted(splats, merge(scene.isects, movers.isects, len(scene.splats.centers))), view)
 
     @torch.no_grad()
-    def _prepare(self, view: View) -> Sorted:
-        return self._sort(self.frozen, view)
+    def _prepare(self, view: Viewpoint, moment: Moment | None) -> Sorted:
+        if moment is None:
+            return self._sort(self.frozen, view, lambda rgb, means, ids: rgb)
+        return self._sort(
+            moment.altered(self.frozen), view, lambda rgb, means, ids: moment.frozen_colors(rgb, means, ids, view)
+        )
 
-    def _sort(self, gaussians: Gaussians, view: View) -> Sorted:
-        """The Gaussians that touch the image, projected and sorted."""
+    def _sort(self, gaussians: Gaussians, view: Viewpoint, shade: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Sorted:
+        """The Gaussians that touch the image, projected and sorted; `shade`: colours, means and indices to the colours that
+        arrive."""
         radii, *projected = self._project(gaussians, view)
         seen = torch.nonzero(radii > 0)[:, 0]  # of the others gsplat leaves the memory as it was
         centers, depths, conics = (tensor[seen] for tensor in projected)
         gaussians = gaussians.select(seen)
-        colors = view_colors(gaussians.colors, gaussians.means, view.viewmat)
+        colors = shade(view_colors(gaussians.colors, gaussians.means, view.viewmat), gaussians.means, seen)
         splats = Splats(centers, conics, torch.cat([colors, depths[:, None]], dim=1), self._opacities(gaussians, view))
         return Sorted(splats, _intersect(centers.detach(), radii[seen], depths.detach(), view))
 
-    def _project(self, gaussians: Gaussians, view: View) -> Sequence[Tensor]:
+    def _project(self, gaussians: Gaussians, view: Viewpoint) -> Sequence[Tensor]:
         """Radii [n] (0 where not drawn), centres [n, 2], depths [n] and conics [n, 3]."""
         still = gaussians.displacements is None
         *found, _ = gsplat.fully_fused_projection(
@@ -144,7 +155,7 @@ class GsplatRasterizer:
         )
         return [tensor[0] for tensor in found]
 
-    def _opacities(self, gaussians: Gaussians, view: View) -> Float[Tensor, "m"]:
+    def _opacities(self, gaussians: Gaussians, view: Viewpoint) -> Float[Tensor, "m"]:
         """Averaged over the exposure; all are in front of the camera."""
         if gaussians.displacements is None:
             return gaussians.opacities
@@ -160,13 +171,13 @@ def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:
     return matrices.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
 
 
-def _intersect(centers: Float[Tensor, "m 2"], radii: Tensor, depths: Float[Tensor, "m"], view: View) -> Isects:
+def _intersect(centers: Float[Tensor, "m 2"], radii: Tensor, depths: Float[Tensor, "m"], view: Viewpoint) -> Isects:
     across, down = -(-view.width // TILE), -(-view.height // TILE)
     _, ids, rows = gsplat.isect_tiles(centers[None], radii[None], depths[None], TILE, across, down)
     return Isects(ids, rows, gsplat.isect_offset_encode(ids, 1, across, down))
 
 
-def _blend(scene: Sorted, view: View) -> Float[Tensor, "h w 5"]:
+def _blend(scene: Sorted, view: Viewpoint) -> Float[Tensor, "h w 5"]:
     centers, conics, features, opacities = (tensor[None] for tensor in scene.splats)
     _, rows, offsets = scene.isects
     sums, accumulation = gsplat.rasterize_to_pixels(

@@ -7,6 +7,7 @@ costs hardly more than what moves in it, at a small error.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from pgsd_nerfstudio.rendering.binning import Binned, bin_splats, keep_entries, visible_by_depth
 from pgsd_nerfstudio.rendering.blending import blend_frozen
 from pgsd_nerfstudio.rendering.layers import Layers, press
+from pgsd_nerfstudio.rendering.moment import Moment, Viewpoint
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
@@ -54,7 +56,11 @@ def motions_array(gaussians: Gaussians) -> np.ndarray:
     return np.zeros((0, 3), np.float32) if moved is None else float_array(moved)
 
 
-def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
+Shade = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
+"""From colours [m, 3], means [m, 3] and indices [m] of Gaussians to the colours that arrive."""
+
+
+def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple[Binned, np.ndarray]:
     """The Gaussians on the image plane of a camera, and which of them each splat is (int32)."""
     splats = np.empty((len(gaussians), COLUMNS), np.float32)
     project(
@@ -69,12 +75,13 @@ def splat(gaussians: Gaussians, view: View) -> tuple[Binned, np.ndarray]:
     )
     ids = visible_by_depth(splats)
     visible = splats[ids]
-    if gaussians.colors.ndim == 2:
+    if gaussians.colors.ndim == 2 and shade is None:
         visible[:, RED : BLUE + 1] = float_array(gaussians.colors)[ids]
     else:
         seen = torch.from_numpy(ids).long()
         colors, means = gaussians.colors.detach()[seen], gaussians.means.detach()[seen]
-        visible[:, RED : BLUE + 1] = view_colors(colors, means, torch.from_numpy(view.viewmat)).numpy()
+        seen_colors = view_colors(colors, means, torch.from_numpy(view.viewmat))
+        visible[:, RED : BLUE + 1] = (seen_colors if shade is None else shade(seen_colors, means, seen)).numpy()
     return bin_splats(visible, view.lens.width, view.lens.height), ids
 
 
@@ -98,16 +105,28 @@ class FrozenViews:
     def __str__(self) -> str:
         return f"{self._cache} ({'exact' if self._layers is None else f'{self._layers} layers'})"
 
-    def get(self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int) -> tuple[View, FrozenView]:
-        """The scene for one camera, made if it is not held."""
+    def get(
+        self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, moment: Moment | None = None
+    ) -> tuple[View, FrozenView]:
+        """The scene for one camera at a moment, made if it is not held."""
         intrinsics = K.detach().cpu().double().numpy()
         pose = np.ascontiguousarray(viewmat.detach().cpu().double().numpy())
         view = View(pose, lens(intrinsics, width, height, self._config))
-        return view, self._cache.get(viewmat, K, width, height, lambda: self._make(view))
+        if moment is None:
+            return view, self._cache.get(viewmat, K, width, height, lambda: self._make(view, self._gaussians))
+        seen_from = Viewpoint(viewmat.detach().cpu().float(), K.detach().cpu().float(), width, height)
 
-    def _make(self, view: View) -> FrozenView:
+        def make() -> FrozenView:
+            def shade(rgb: torch.Tensor, means: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+                return moment.frozen_colors(rgb, means, ids, seen_from)
+
+            return self._make(view, moment.altered(self._gaussians), shade)
+
+        return view, self._cache.get(viewmat, K, width, height, make, moment.key)
+
+    def _make(self, view: View, gaussians: Gaussians, shade: Shade | None = None) -> FrozenView:
         width, height = view.lens.width, view.lens.height
-        binned, _ = splat(self._gaussians, view)
+        binned, _ = splat(gaussians, view, shade)
         needed = np.zeros(len(binned.entries), bool)
         image = np.empty((5, height, width), np.float32)
         limits = np.float32(self._config.max_alpha), np.float32(self._config.min_transmittance)

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, Protocol, TypeAlias
 from jaxtyping import Float
 from torch import Tensor
 
+from pgsd_nerfstudio.rendering.moment import Moments
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
@@ -91,13 +92,21 @@ class Rasterizer(Protocol):
         """What is kept of the frozen scene for the cameras seen so far, in words."""
         ...
 
-    def render(self, cameras: Cameras, dynamic: Dynamic = None, background: Float[Tensor, "3"] | None = None) -> Rendering:
+    def render(
+        self,
+        cameras: Cameras,
+        dynamic: Dynamic = None,
+        background: Float[Tensor, "3"] | None = None,
+        moments: Moments = None,
+    ) -> Rendering:
         """The frozen scene merged by depth with the dynamic Gaussians, over the background (black if None).
 
+        `moments` say how the weather changes the frozen scene, the light on its way and the background.
         Differentiable in all tensors of the dynamic Gaussians and in the background, not in the frozen scene or cameras.
 
         Raises:
-            ValueError: the number of sets is not that of the cameras, or a value is not finite; the message names which.
+            ValueError: the number of sets or moments is not that of the cameras, or a value is not finite; the message names
+                which.
         """
         ...
 
@@ -126,7 +135,7 @@ def composite(
     color: Float[Tensor, "*s h w 3"],  # sum of weights times colours
     weighted_depth: Float[Tensor, "*s h w"],  # sum of weights times depths
     accumulation: Float[Tensor, "*s h w"],  # sum of weights
-    background: Float[Tensor, "3"] | None,
+    background: Tensor | None,  # [3], or as `moment.backgrounds`
 ) -> Rendering:
     """Background and expected depth from the sums along the rays."""
     if background is not None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
+from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig, Rendering, composite
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
@@ -107,17 +108,21 @@ def render_reference(
     background: Float[Tensor, "3"] | None = None,
     config: RasterConfig | None = None,
     *,
+    moments: Moments = None,
     dtype: torch.dtype = torch.float64,
 ) -> Rendering:
     """Render one set, or several (each with plain RGB or harmonics) as one scene; differentiable in all of them.
 
+    Of several the first is the frozen scene, for `moments` that tell it from what moves.
     Gaussians of equal depth are drawn in the order given. In float64 it is the judge; with `dtype` float32 it stands in
     benches for a vectorised torch rasterizer of the same conventions.
     """
     config = config or RasterConfig()
     sets = [one.to(dtype) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
-    clip = torch.stack([_render_frame(cameras, k, sets, config) for k in range(len(cameras))])
-    return composite(clip[..., :3], clip[..., 3], clip[..., 4], background)
+    at = moment_per_frame(moments, len(cameras))
+    clip = torch.stack([_render_frame(cameras, k, sets, config, at[k]) for k in range(len(cameras))])
+    behind = backgrounds(background, cameras, at, clip)
+    return composite(clip[..., :3], clip[..., 3], clip[..., 4], behind)
 
 
 @torch.no_grad()
@@ -138,11 +143,21 @@ def certain_pixels(
     return certain
 
 
-def _render_frame(cameras: Cameras, k: int, sets: Sequence[Gaussians], config: RasterConfig) -> Float[Tensor, "h w 5"]:
-    viewmat, K = cameras.viewmats[k].to(sets[0].means), cameras.Ks[k].to(sets[0].means)
+def _render_frame(
+    cameras: Cameras, k: int, sets: Sequence[Gaussians], config: RasterConfig, moment: Moment | None
+) -> Float[Tensor, "h w 5"]:
+    view = Viewpoint.of(cameras, k, sets[0].means)
+    viewmat, K = view.viewmat, view.K
+    if moment is not None:
+        sets = [moment.altered(sets[0]), *sets[1:]]
     parts = [project_reference(one, viewmat, K, cameras.width, cameras.height, config) for one in sets]
     projection = Projection(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
-    colors = torch.cat([view_colors(one.colors, one.means, viewmat) for one in sets])
+    seen = [view_colors(one.colors, one.means, viewmat) for one in sets]
+    if moment is not None:
+        frozen = moment.frozen_colors(seen[0], sets[0].means, torch.arange(len(sets[0])), view)
+        moving = [moment.moving_colors(rgb, one.means, view) for rgb, one in zip(seen[1:], sets[1:], strict=True)]
+        seen = [frozen, *moving]
+    colors = torch.cat(seen)
     order = projection.depths.float().argsort(stable=True)  # gsplat sorts single precision depths
     image = torch.zeros(cameras.height, cameras.width, 5).to(viewmat)
     for top in range(0, cameras.height, TILE):

@@ -38,10 +38,18 @@ class ViewCache(Generic[V]):
     def __str__(self) -> str:
         return f"{len(self)} prepared views, {self.nbytes / 1e6:,.0f} of at most {self.cache_bytes / 1e6:,.0f} MB"
 
-    def get(self, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int, make: Callable[[], V]) -> V:
-        """The view of a camera, made if it is not held."""
+    def get(
+        self,
+        viewmat: Float[Tensor, "4 4"],
+        K: Float[Tensor, "3 3"],
+        width: int,
+        height: int,
+        make: Callable[[], V],
+        moment: bytes = b"",
+    ) -> V:
+        """The view of a camera at a moment, made if it is not held."""
         numbers = torch.cat([viewmat.flatten(), K.flatten()]).detach().cpu().double().numpy()
-        key = numbers.tobytes() + f"{width}x{height}".encode()
+        key = numbers.tobytes() + f"{width}x{height}".encode() + moment
         with self._lock:
             if key in self._views:
                 self._views.move_to_end(key)

@@ -65,6 +65,20 @@ class Frame:
         viewmats[:, :3, 3] = self.metres_per_unit * (rotation @ self.origin.to(rotation) + shift)
         return replace(cameras, viewmats=viewmats)
 
+    def gaussians_to_metric(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians in scene units as Gaussians in metres; the inverse of `gaussians_to_scene`, with its ValueError."""
+        if gaussians.sh_degree:
+            raise ValueError(f"only Gaussians of plain colour change frames, found SH colours of degree {gaussians.sh_degree}")
+        turn = roma.rotmat_to_unitquat(self.rotation.double()).to(gaussians.quats)  # xyzw, scene to metric
+        quats = roma.quat_product(turn.expand(len(gaussians), 4), roma.quat_wxyz_to_xyzw(gaussians.quats))
+        return replace(
+            gaussians,
+            means=self.to_metric(gaussians.means),
+            quats=roma.quat_xyzw_to_wxyz(quats),
+            scales=gaussians.scales * self.metres_per_unit,
+            displacements=None if gaussians.displacements is None else self.vectors_to_metric(gaussians.displacements),
+        )
+
     def gaussians_to_scene(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians in metres as Gaussians in scene units; differentiable.
 

@@ -90,6 +90,9 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     if looks.active.opacity is None:
         shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one
         active = ParticleLook(opacity_of_extinction(shadow, active.scales), active.scales, active.rgb)
+    if looks.active.fades_below > 0:
+        thin = (diameters / looks.active.fades_below).clamp_max(1.0) ** 2
+        active = ParticleLook(active.opacity * thin, active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
     # No patch wider than the surface around it: nothing hangs over the edge of a table.
     widest = (particles.rest_extents.cpu() / REACH).clamp_min(0.004)

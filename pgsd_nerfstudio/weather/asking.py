@@ -12,7 +12,7 @@ import json
 import re
 import sys
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -23,7 +23,7 @@ from pgsd_nerfstudio.weather.reader import NO_WEATHER, check, read
 from pgsd_nerfstudio.weather.wish import SCHEMA, Wish
 
 RETRIES = 1  # of a request that got no answer or an error that may pass
-MODEL = re.compile(r"(?P<provider>[a-z0-9_]+):(?P<name>\S+)")
+MODEL = re.compile(r"[a-z0-9_]+:\S+")
 HOW_TO_NAME = (
     "PROVIDER:NAME such as openai:NAME, anthropic:NAME, or vllm:NAME for a server of your own that speaks OpenAI's protocol "
     "(then its address too, http://127.0.0.1:8000/v1)"
@@ -49,7 +49,8 @@ class Granted:
     by: str
     """The model, or the word "reader"."""
     remark: str
-    """What the reader used and ignored, and why it had to step in if a model was asked first."""
+    """Which model was asked and what it said; or what the reader used and ignored, and why it had to step in if a model was
+    asked first."""
 
 
 def wish_for(
@@ -70,18 +71,37 @@ def wish_for(
     Raises:
         AskingError: the model gave no usable answer, and the reader was not allowed to step in.
         ValueError: the text is empty, too long or names nothing that could be in the air.
+        OSError: the answer of a model cannot be written.
     """
     if model is None:
         reading = read(prompt)
         return Granted(wish=reading.wish, by="reader", remark=str(reading))
     folder = cache_dir or shared_cache() / "wishes"
     try:
-        return Granted(wish=ask(prompt, model=model, base_url=base_url, cache_dir=folder, timeout=timeout), by=model, remark="")
+        wish = ask(prompt, model=model, base_url=base_url, cache_dir=folder, timeout=timeout)
     except AskingError as error:
         if not reader_fallback:
             raise
-        reading = read(prompt)
-        return Granted(wish=reading.wish, by="reader", remark=f"{error}. Read without it: {reading}")
+        try:
+            reading = read(prompt)
+        except ValueError as unread:
+            raise ValueError(f"{error}. The built-in reader was asked instead: {unread}") from error
+        return Granted(wish=reading.wish, by="reader", remark=f"{error}. The built-in reader answers instead: {reading}")
+    return Granted(wish=wish, by=model, remark=f"{model} was asked what {prompt.strip()!r} means: {_told(wish)}")
+
+
+def _told(wish: Wish) -> str:
+    """In one line, what a wish says beside its defaults."""
+    defaults = {field.name: field.default for field in fields(Wish)}
+    said = {name: value for name in defaults if (value := getattr(wish, name)) != defaults[name] and name != "prompt"}
+    base = said.pop("base")
+    return ", ".join([str(base), *(f"{name.replace('_', ' ')} {_written(value)}" for name, value in said.items())])
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"({', '.join(f'{c:.2f}' for c in value)})" if isinstance(value, tuple) else f"{value:.2g}"
 
 
 def ask(prompt: str, *, model: str, base_url: str | None = None, cache_dir: Path, timeout: float = 60.0) -> Wish:
@@ -110,6 +130,18 @@ def ask(prompt: str, *, model: str, base_url: str | None = None, cache_dir: Path
     if wish.base is None:
         raise ValueError(f"{prompt!r} {NO_WEATHER} (so says {model})")
     return wish
+
+
+def check_model(model: str, base_url: str | None) -> None:
+    """Refuse what cannot be the name of a model or the address of a server.
+
+    Raises:
+        AskingError: the name is not PROVIDER:NAME, or the address does not begin with http:// or https:// and a host.
+    """
+    if not MODEL.fullmatch(model):
+        raise AskingError(f"a language model must be named {HOW_TO_NAME}, found {model!r}")
+    if base_url is not None and not re.match(r"https?://[^/]", base_url):
+        raise AskingError(f"the address of {model} must begin with http:// or https:// and a host, found {base_url!r}")
 
 
 def _asked(prompt: str, model: str, base_url: str | None, timeout: float) -> Wish:
@@ -155,6 +187,8 @@ class Connection:
 
     @staticmethod
     def open(model: str, base_url: str | None, timeout: float) -> Connection:
+        check_model(model, base_url)
+        provider, _, name = model.partition(":")
         try:
             from any_llm import AnyLLM
             from any_llm.exceptions import AnyLLMError, MissingApiKeyError, UnsupportedProviderError
@@ -163,12 +197,6 @@ class Connection:
             raise AskingError(
                 f"asking {model} needs the library any-llm{version}: pip install 'pgsd-nerfstudio[llm]'"
             ) from error
-        named = MODEL.fullmatch(model)
-        if not named:
-            raise AskingError(f"a language model must be named {HOW_TO_NAME}, found {model!r}")
-        provider = named["provider"]
-        if base_url is not None and not re.match(r"https?://[^/]", base_url):
-            raise AskingError(f"the address of {model} must begin with http:// or https:// and a host, found {base_url!r}")
         try:
             client = AnyLLM.create(provider, api_base=base_url, unified_exceptions=True, max_retries=RETRIES)
         except UnsupportedProviderError as error:
@@ -181,7 +209,7 @@ class Connection:
             raise AskingError(f"asking {model} needs one more library: pip install 'any-llm-sdk[{provider}]'") from error
         except AnyLLMError as error:
             raise AskingError(f"{model} cannot be asked: {_line(error)}") from error
-        return Connection(client, model, named["name"], base_url, timeout)
+        return Connection(client, model, name, base_url, timeout)
 
     def answer(self, messages: list[dict[str, str]]) -> str:
         """What the model says next.

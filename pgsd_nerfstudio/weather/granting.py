@@ -14,20 +14,24 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pgsd_nerfstudio.weather.effect import EFFECTS, Appearance, Effect, StateLook, Wind
+from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import INTENSITIES, Emission, Material
 from pgsd_nerfstudio.weather.touch import SurfaceResponse
-from pgsd_nerfstudio.weather.wish import Wish
+from pgsd_nerfstudio.weather.wish import Rgb, Wish
 
 GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
 """Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
 is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the
 snowflakes are opaque and the rest fade."""
+HAZE_SHARE = 0.35
+"""Part of the way from the base's haze to the colour of what flies: what hangs in the air is mostly the same air."""
 
 
 def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
     """The effect that a wish asks for; what it says nothing about stays as the base has it.
 
-    - `rgb`, `landed_rgb`: colour in the air and landed; None keeps the base's.
+    - `rgb`: colour of what flies, and of what has landed where `landed_rgb` says no other; the haze takes HAZE_SHARE of it.
+    - `landed_rgb`: colour of what has landed.
     - `size`: see the module.
     - `amount`: precipitation times it, or visibility divided by it, within INTENSITIES. Fog, whose parcels stand for droplets
       of a given extinction, gets more parcels if they are smaller or hold more, so that none has to be darker than opaque.
@@ -37,7 +41,7 @@ def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
     - `fall_speed`: factor of the law of fall speeds. At the same precipitation slower particles are closer together.
     - `wind`: mean wind, turbulence and the eddies below it. Gusts are a share of the mean wind and grow with it.
     - `tumbling`: speed of the swaying at the same rate, so wider circles. What does not sway by itself (all but snow) stays so.
-    - `accumulates`: False lets particles vanish where they land: they raise no cover and have no opacity. True changes nothing:
+    - `accumulates`: False lets what would stay vanish where it lands: no cover, no opacity. True changes nothing:
       snow and sand gather anyway, rain and fog do not (see `remarks`).
     - `prompt`: as it is. `name` stays that of the base: the paper's physics is looked up by it.
 
@@ -52,6 +56,7 @@ def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
         wind=_wind(wish, base.wind),
         surface=_surface(wish, base.surface),
         appearance=_appearance(wish, base),
+        haze=_haze(wish.rgb, base.haze),
         prompt=wish.prompt,
     )
 
@@ -128,9 +133,9 @@ def _wind(wish: Wish, wind: Wind) -> Wind:
 
 
 def _surface(wish: Wish, surface: SurfaceResponse) -> SurfaceResponse:
-    if not _vanishes(wish, surface):
-        return surface
-    return replace(surface, landing="vanishes", splash=None, accumulates=False)
+    if wish.accumulates is False:
+        surface = replace(surface, accumulates=False)
+    return replace(surface, landing="vanishes", splash=None) if _vanishes(wish, surface) else surface
 
 
 def _vanishes(wish: Wish, surface: SurfaceResponse) -> bool:
@@ -149,10 +154,17 @@ def _appearance(wish: Wish, base: Effect) -> Appearance:
         tone_spread=_towards(active.tone_spread, GLITTER_TONES, wish.glitter),
         opacity_spread=_towards(active.opacity_spread, GLITTER_OPACITIES, wish.glitter),
     )
-    collided = replace(collided, rgb=wish.landed_rgb or collided.rgb)
+    collided = replace(collided, rgb=wish.landed_rgb or wish.rgb or collided.rgb)
     if _vanishes(wish, base.surface):
         collided = replace(collided, opacity=0.0)
     return replace(looks, active=active, collided=collided)
+
+
+def _haze(rgb: Rgb | None, haze: Haze | None) -> Haze | None:
+    if rgb is None or haze is None:
+        return haze
+    red, green, blue = (own + HAZE_SHARE * (asked - own) for own, asked in zip(haze.rgb, rgb, strict=True))
+    return replace(haze, rgb=(red, green, blue))
 
 
 def _look(wish: Wish, state: StateLook) -> StateLook:

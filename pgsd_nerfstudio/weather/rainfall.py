@@ -5,7 +5,9 @@ Sizes: Marshall & Palmer, "The distribution of raindrops with size" (1948). Fall
 
 from __future__ import annotations
 
+from pgsd_nerfstudio.weather.ambience import Ambience
 from pgsd_nerfstudio.weather.effect import Appearance, Effect, StateLook, Wind, register
+from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import Emission, Material
 from pgsd_nerfstudio.weather.touch import Splash, SurfaceResponse
 
@@ -14,20 +16,24 @@ WATER = Material(mass_milligram=0.5236, mass_exponent=3.0, speed_law="rain")  # 
 RAINFALL = register(
     Effect(
         name="rainfall",
-        emission=Emission(kind="raindrops", intensity=12.0, smallest=0.0005, largest=0.005, importance=1.0),
+        emission=Emission(kind="raindrops", intensity=12.0, smallest=0.0010, largest=0.005, importance=1.5),
         material=WATER,
         wind=Wind(speed=2.0, turbulence=0.25, flutter=0.0),
-        surface=SurfaceResponse(landing="wets", splash=Splash(), accumulates=False),
+        surface=SurfaceResponse(landing="wets", splash=Splash(), accumulates=False, darkens=0.012),
         appearance=Appearance(
             active=StateLook(
-                scale_per_diameter=(0.9, 0.9, 0.9),
+                scale_per_diameter=(1.5, 1.5, 1.5),
                 scale_spread=0.0,
-                opacity=0.95,
-                opacity_spread=0.15,
-                rgb=(0.86, 0.89, 0.93),
+                opacity=0.97,
+                opacity_spread=0.2,
+                fades_below=1.2e-3,
+                rgb=(0.88, 0.91, 0.95),
+                tone_spread=0.1,
             ),
-            exposure=1 / 60,
+            exposure=1 / 50,
         ),
+        haze=Haze(rgb=(0.62, 0.66, 0.70)),
+        ambience=Ambience(clouds=1.0, stops=-0.5, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),
         prompt="Heavy rain is falling in {scene}, raindrops streak through the air and splash, surfaces are wet and dark. "
         "Photorealistic, high detail",
         negative_prompt="static, no rain, dry, sunny, blurry, distorted, cartoon, low quality",

@@ -5,8 +5,11 @@ Sizes: the sand populations of desert soils of Tegen et al. (2002). Fall speeds:
 
 from __future__ import annotations
 
+from pgsd_nerfstudio.weather.ambience import Ambience
 from pgsd_nerfstudio.weather.effect import Appearance, Effect, StateLook, Wind, register
+from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
+from pgsd_nerfstudio.weather.spell import Spell
 from pgsd_nerfstudio.weather.touch import SurfaceResponse
 
 QUARTZ = Material(mass_milligram=1.3875, mass_exponent=3.0, speed_law="sand")  # a sphere of 2650 kg/m^3
@@ -17,6 +20,7 @@ SANDSTORM = register(
         emission=Emission(kind="sand grains", intensity=60.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
+        spell=Spell(onset=5.0, arrives="as a front"),
         surface=SurfaceResponse(
             holds_degrees=40.0,
             slips_degrees=95.0,
@@ -43,6 +47,8 @@ SANDSTORM = register(
             ),
             exposure=1 / 60,
         ),
+        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.7, patch_size=10.0),
+        ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
         prompt="A sandstorm sweeps through {scene}, sand grains fly in the wind, dust hangs in the air and sand settles on "
         "surfaces. Photorealistic, high detail",
         negative_prompt="static, clear air, no sand, snow, rain, distorted, cartoon, low quality",

@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.weather.ambience import Ambience
 from pgsd_nerfstudio.weather.effect import Appearance, Effect, StateLook, Wind, register
+from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
 from pgsd_nerfstudio.weather.touch import SurfaceResponse
 
@@ -26,7 +28,7 @@ SNOWFALL = register(
         emission=Emission(intensity=1.5, smallest=0.0015, largest=0.012),
         material=AGGREGATES,
         wind=Wind(),
-        surface=SurfaceResponse(),
+        surface=SurfaceResponse(hides=0.014),
         dense=Dense(matter="snow"),
         appearance=Appearance(
             active=StateLook(scale_per_diameter=(0.34, 0.28, 0.16), scale_spread=0.2, opacity=0.8, opacity_spread=0.18),
@@ -39,6 +41,8 @@ SNOWFALL = register(
                 settle_seconds=1.5,
             ),
         ),
+        haze=Haze(rgb=(0.83, 0.85, 0.88)),
+        ambience=Ambience(clouds=1.0, stops=-0.1, tint=(0.96, 1.0, 1.06), saturation=0.8, sky=(0.83, 0.85, 0.88)),
         prompt="Fluffy snowflakes are falling in {scene}, accumulating on surfaces. Photorealistic, high detail",
         negative_prompt="static, no snow, blurry, distorted, cartoon, low quality, grey, dirty, dark, ugly",
     )

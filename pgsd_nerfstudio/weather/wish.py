@@ -33,7 +33,7 @@ class Wish:
     rgb: Rgb | None = None
     """Colour of what flies, sRGB. null keeps the base's."""
     landed_rgb: Rgb | None = None
-    """Colour of what has landed, sRGB. null keeps the base's."""
+    """Colour of what has landed, sRGB. null: that of what flies."""
     size: Annotated[float, Field(ge=0.2, le=5)] = 1.0
     """Factor on the diameter of the particles (the base's snowflakes have 1.5-12 mm)."""
     amount: Annotated[float, Field(ge=0.1, le=5)] = 1.0

@@ -1,0 +1,194 @@
+"""What the air takes of the light on its way to the camera, and what it gives instead: fog, dust, falling rain and snow.
+
+Along a ray, light of colour c from distance d arrives as c T + A (1 - T), T = exp(-optical depth), A the airlight (Koschmieder
+1924; Beer-Lambert). Blending is linear, so it is exact for splats to let each Gaussian's colour through the air by itself, from
+its centre on, and to blend afterwards: every rasterizer shows it, as none knows of it.
+
+A medium that differs from place to place is sampled once for each camera, in froxels (Wronski, "Volumetric fog", SIGGRAPH 2014):
+along a fan of rays, in slices that grow with distance. A Gaussian reads its optical depth between the rays, so that the cost
+hardly depends on their number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import brentq
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
+"""Per scene unit, at points in scene units."""
+
+BEYOND = 100.0  # times the farthest slice: as far as the air of the last slice goes on
+
+
+@dataclass(frozen=True, kw_only=True)
+class Froxels:
+    """How finely the air before a camera is sampled, along its rays. Lengths in scene units."""
+
+    nearest: float = 0.4
+    """Thickness of the slice at the camera; each is thicker than the one before by the same factor."""
+    farthest: float = 400.0
+    """Where the last slice ends; beyond, the air goes on as in it."""
+    slices: int = 64
+    rays: int = 36
+    """Across the wider side of the image, whatever its size: what counts is how far apart they are in the air. 14 pixels of 512."""
+    margin: float = 0.5
+    """How far the fan reaches beyond each side of the image, in halves of the image; still farther out its edge goes on."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.nearest * self.slices < self.farthest:
+            raise ValueError(
+                f"slices that grow from {self.nearest:g} must reach farther than {self.slices} even ones, "
+                f"{self.nearest * self.slices:g} scene units; found {self.farthest:g}"
+            )
+
+    @cached_property
+    def edges(self) -> Float[Tensor, "s+2"]:
+        """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
+        ratio = self.farthest / self.nearest
+        growth = float(brentq(lambda g: math.log(math.expm1(g * self.slices) / math.expm1(g) / ratio), 1e-9, 600 / self.slices))
+        within = self.nearest / math.expm1(growth) * torch.expm1(growth * torch.arange(self.slices + 1, dtype=torch.float64))
+        return torch.cat([within, BEYOND * within[-1:]])
+
+
+class Medium:
+    """The air of one moment; knows nothing of weather. May be asked from several threads."""
+
+    def __init__(self, airlight: Float[Tensor, "3"], extinction: Extinction | float, froxels: Froxels | None = None) -> None:
+        """`extinction` per scene unit: a number for air that is the same everywhere, which needs no froxels and is exact.
+
+        Raises:
+            ValueError: a number is negative or not finite.
+        """
+        if not callable(extinction) and not 0 <= extinction < math.inf:
+            raise ValueError(f"an extinction per scene unit must be finite and not negative, found {extinction}")
+        self.airlight = airlight
+        self.extinction = extinction
+        self.froxels = froxels or Froxels()
+        self._sampled: tuple[tuple[Tensor, Tensor, int, int], Tensor] | None = None
+
+    def through(
+        self,
+        rgb: Float[Tensor, "n 3"],
+        means: Float[Tensor, "n 3"],
+        viewmat: Float[Tensor, "4 4"],
+        K: Float[Tensor, "3 3"],
+        width: int,
+        height: int,
+    ) -> Float[Tensor, "n 3"]:
+        """Colours as they arrive at the camera from `means`; differentiable in both."""
+        return self._mixed(rgb, self.optical_depth(means, viewmat, K, width, height)[:, None])
+
+    def behind(
+        self,
+        background: Float[Tensor, "3"] | None,
+        viewmat: Float[Tensor, "4 4"],
+        K: Float[Tensor, "3 3"],
+        width: int,
+        height: int,
+        far: float,
+    ) -> Tensor:
+        """A background (black if None) at the distance `far` as it arrives: [3] where the air is the same everywhere, else
+        [h, w, 3].
+
+        Raises:
+            ValueError: `far` is not a positive number of scene units.
+        """
+        if not 0 < far < math.inf:
+            raise ValueError(f"the background must lie at a positive, finite distance, found {far} scene units")
+        own = torch.zeros(3).to(viewmat) if background is None else background
+        if not callable(self.extinction):
+            return self._mixed(own, torch.tensor(self.extinction * far).to(own))
+        depths = self._depths(viewmat, K, width, height)
+        slot = self._slots(torch.tensor([far]).to(depths))
+        here = int(slot)
+        layer = torch.lerp(depths[here], depths[here + 1], slot - here)
+        x, y = (0.5 + torch.arange(side).to(depths) for side in (width, height))
+        at = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        read = grid_sample(layer[None, None], self._across(at, width, height)[None], "bilinear", "border", align_corners=True)
+        return self._mixed(own, read[0, 0, :, :, None].to(own))
+
+    def optical_depth(
+        self,
+        means: Float[Tensor, "n 3"],
+        viewmat: Float[Tensor, "4 4"],
+        K: Float[Tensor, "3 3"],
+        width: int,
+        height: int,
+    ) -> Float[Tensor, "n"]:
+        """The integral of the extinction from the camera's centre to each point; T = exp(-it)."""
+        viewmat, K = viewmat.to(means), K.to(means)
+        distances = (means - _center(viewmat)).norm(dim=1)
+        if not callable(self.extinction):
+            return self.extinction * distances
+        depths = self._depths(viewmat, K, width, height)
+        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        # What is beside or behind the camera is not drawn; it only must not divide by zero.
+        pixels = points[:, :2] / points[:, 2:].clamp_min(1e-6) * K.diagonal()[:2] + K[:2, 2]
+        along = 2.0 * self._slots(distances) / (len(depths) - 1) - 1.0
+        at = torch.cat([self._across(pixels, width, height), along[:, None]], dim=1)
+        read = grid_sample(depths[None, None], at[None, :, None, None, :], "bilinear", "border", align_corners=True)
+        return read[0, 0, :, 0, 0]
+
+    def _mixed(self, rgb: Tensor, depth: Tensor) -> Tensor:
+        return rgb * torch.exp(-depth) - self.airlight.to(rgb) * torch.expm1(-depth)
+
+    def _slots(self, distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Where distances lie among the edges of the slices, linear within each: even air is met exactly."""
+        edges = self.froxels.edges.to(distances)
+        slice_of = (torch.searchsorted(edges, distances.detach(), right=True) - 1).clamp(0, len(edges) - 2)
+        start, end = edges[slice_of], edges[slice_of + 1]
+        return slice_of + ((distances - start) / (end - start)).clamp(0.0, 1.0)
+
+    def _across(self, pixels: Float[Tensor, "*n 2"], width: int, height: int) -> Float[Tensor, "*n 2"]:
+        """Pixels in the fan of rays, -1..1, and no farther."""
+        half = 0.5 * torch.tensor([width, height]).to(pixels)
+        return ((pixels / half - 1.0) / (1.0 + self.froxels.margin)).clamp(-1.0, 1.0)
+
+    @torch.no_grad()
+    def _depths(
+        self, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
+    ) -> Float[Tensor, "s+2 rows columns"]:
+        """Optical depth at the edges of the slices along each ray of the fan; that of the last view is kept."""
+        view = viewmat.detach(), K.detach(), width, height
+        if self._sampled is not None and _same(self._sampled[0], view):
+            return self._sampled[1]
+        rays = self._rays(*view)
+        edges = self.froxels.edges.to(rays)
+        middles = 0.5 * (edges[:-2] + edges[1:-1])
+        points = _center(view[0]) + middles[:, None, None, None] * rays
+        assert callable(self.extinction)
+        found = self.extinction(points.view(-1, 3)).view(points.shape[:3])
+        slices = torch.cat([torch.zeros_like(found[:1]), found, found[-1:]])
+        slices[1:] *= edges.diff()[:, None, None]
+        depths = slices.cumsum(0)
+        self._sampled = (view[0].clone(), view[1].clone(), width, height), depths
+        return depths
+
+    def _rays(self, viewmat: Tensor, K: Tensor, width: int, height: int) -> Float[Tensor, "rows columns 3"]:
+        """Unit vectors of the fan in scene axes, from corner to corner."""
+        spacing = max(width, height) / self.froxels.rays
+        reach = 0.5 * (1.0 + self.froxels.margin)
+        x, y = (
+            (side * (0.5 + torch.linspace(-reach, reach, math.ceil(2 * reach * side / spacing) + 1)).to(K) - center) / focal
+            for side, center, focal in zip((width, height), K[:2, 2], K.diagonal()[:2], strict=True)
+        )
+        flat = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+        return normalize(torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1), dim=-1) @ viewmat[:3, :3]
+
+
+def _center(viewmat: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
+    return torch.linalg.inv(viewmat.double())[:3, 3].to(viewmat)
+
+
+def _same(one: tuple[Tensor, Tensor, int, int], other: tuple[Tensor, Tensor, int, int]) -> bool:
+    alike = one[2:] == other[2:] and (one[0].dtype, one[0].device) == (other[0].dtype, other[0].device)
+    return alike and torch.equal(one[0], other[0]) and torch.equal(one[1], other[1])

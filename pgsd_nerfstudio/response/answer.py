@@ -1,0 +1,217 @@
+"""The frozen scene's answer to a weather: what a camera sees of it at a second, as a function of its Gaussians and of time.
+
+Its own tensors are never changed. In order: edited pictures, where there are some; the light of the weather on what is there;
+water that darkens and mirrors; the layer that hides; the air in between.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgsd_nerfstudio.rendering.moment import Viewpoint
+from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
+from pgsd_nerfstudio.response.exposure import Exposure
+from pgsd_nerfstudio.response.layers import Layers
+from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, wetted
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather.ambience import Ambience
+from pgsd_nerfstudio.weather.effect import Effect
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.rendering.medium import Medium
+    from pgsd_nerfstudio.response.edited import Edits
+    from pgsd_nerfstudio.response.haze import HazeField
+
+FAR = 3000.0  # m: where the sky begins, as far as haze is concerned
+OPAQUE_UNDER = 1.5  # a full layer is as opaque as this many more Gaussians in the same place
+WIDER_UNDER = 0.25  # and by so much wider, to close the gaps between blades and stones
+SHELTERED_LIGHT = (0.42, 0.46, 0.55)  # linear light on a layer where no sky is seen, bluish, from all that is bright around
+MIDDLE = 0.18  # linear light of a middle grey
+RELIEF = 0.22  # share of a layer's light that follows the light of what it lies on: its folds are not filled at once
+WAXEN = 0.75  # share of a wet look that leaves do not take on
+SMOOTH = 0.75  # share of what a level film of water would mirror that rough ground does
+
+_numbers = itertools.count()
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """N frozen Gaussians in a weather; all tensors on one device."""
+
+    effect: Effect
+    exposure: Exposure
+    layers: Layers
+    softening: Float[Tensor, "n"] | None
+    """Factor on linear light when all of the ambience's clouds have come; None where no sun was found."""
+    up: Float[Tensor, "3 3"]
+    """Scene axes to metric axes."""
+    metres_per_unit: float
+    haze: HazeField | None = None
+    edits: Edits | None = None
+    seconds: float = 10.0
+    """When edited pictures are reached in full."""
+    number: int = field(default_factory=lambda: next(_numbers))
+
+    def at(self, seconds: float) -> Shown | None:
+        """What is seen at a second; None where the scene is still as it was, to the bit."""
+        if self.effect.spell.starts_clear and seconds <= 0:
+            return None
+        medium = self.haze.at(seconds) if self.haze is not None else None
+        hidden, wet = self.layers.hidden(seconds), self.layers.wet(seconds)
+        shown = Shown(self, seconds, medium, hidden, wet)
+        return shown if shown.changes else None
+
+    def to(self, device: torch.device | str) -> Answer:
+        """The same on another device."""
+        return self._each(lambda tensor: tensor.to(device), up=self.up.to(device))
+
+    def select(self, which: Tensor) -> Answer:
+        """The answer of some of the Gaussians, by mask or by index."""
+        return self._each(lambda tensor: tensor[which])
+
+    def thicker(self, factor: float) -> Answer:
+        """The same weather with more haze, or less."""
+        if self.haze is None or factor == 1.0:
+            return self
+        return replace(self, haze=replace(self.haze, extinction=self.haze.extinction * factor), number=next(_numbers))
+
+    def _each(self, change: Callable[[Tensor], Tensor], **others: Any) -> Answer:
+        return replace(
+            self,
+            exposure=_mapped(self.exposure, change),
+            layers=_mapped(self.layers, change),
+            edits=None if self.edits is None else _mapped(self.edits, change),
+            softening=None if self.softening is None else change(self.softening),
+            number=next(_numbers),
+            **others,
+        )
+
+    def share_of_edits(self, seconds: float) -> Float[Tensor, "n"]:
+        """How far each Gaussian has gone towards the edited pictures: as its own layer has grown, elsewhere as the weather."""
+        final, now = self.layers.hidden(self.seconds), self.layers.hidden(seconds)
+        spell = self.effect.spell
+        overall = spell.fallen(seconds) / max(spell.fallen(self.seconds), 1e-9)
+        return torch.where(final > 0.02, now / final.clamp_min(0.02), min(overall, 1.0)).clamp(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One moment, as a rasterizer asks for it (rendering.moment.Moment)."""
+
+    answer: Answer
+    seconds: float
+    medium: Medium | None
+    hidden: Float[Tensor, "n"]
+    wet: Float[Tensor, "n"]
+
+    @property
+    def key(self) -> bytes:
+        return f"answer {self.answer.number} at {self.seconds:.6f}".encode()
+
+    @property
+    def changes(self) -> bool:
+        """Whether anything looks other than without weather."""
+        lies = bool((self.hidden > 0).any()) or bool((self.wet > 0).any())
+        lights = self.answer.effect.ambience is not None and self.share > 0
+        return lies or lights or self.medium is not None or (self.answer.edits is not None and self.seconds > 0)
+
+    @property
+    def share(self) -> float:
+        """How much of the weather has come."""
+        return self.answer.effect.spell.share(self.seconds)
+
+    def altered(self, frozen: Gaussians) -> Gaussians:
+        """Under a layer Gaussians are wider and more opaque; edited pictures move them first."""
+        if self.answer.edits is not None:
+            frozen = self.answer.edits.applied(frozen, self.answer.share_of_edits(self.seconds))
+        if not bool((self.hidden > 0).any()):
+            return frozen
+        opacities = 1 - (1 - frozen.opacities) ** (1 + OPAQUE_UNDER * self.hidden)
+        return replace(frozen, opacities=opacities, scales=frozen.scales * (1 + WIDER_UNDER * self.hidden[:, None]))
+
+    def frozen_colors(
+        self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], view: Viewpoint
+    ) -> Float[Tensor, "m 3"]:
+        towards = torch.nn.functional.normalize(view.center - means, dim=1) @ self.answer.up.T.to(means)
+        return self.moving_colors(self.lit(rgb, ids, towards), means, view)
+
+    def moving_colors(self, rgb: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], view: Viewpoint) -> Float[Tensor, "n 3"]:
+        return rgb if self.medium is None else self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
+
+    def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
+        if self.medium is None:
+            return own
+        far = FAR / self.answer.metres_per_unit
+        return self.medium.behind(own, view.viewmat, view.K, view.width, view.height, far)
+
+    def lit(self, rgb: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
+        """Colours [m, 3] of frozen Gaussians in the light and under the matter of the moment, without air.
+
+        Args:
+            towards: metric unit vectors to the camera; None: no mirror.
+        """
+        answer, ambience = self.answer, self.answer.effect.ambience
+        light = linear(rgb)
+        if ambience is not None:
+            light = self._in_weather(light, ids, ambience)
+        wet = self.wet[ids, None].to(light)
+        if answer.effect.surface.landing == "wets":
+            wet = wet * (1 - WAXEN * leafy(light)[:, None])
+            light = torch.lerp(light, wetted(light), wet)
+            if towards is not None:
+                light = light + wet * self._mirror(ids, towards, ambience or Ambience())
+        hidden = self.hidden[ids, None].to(light)
+        return encoded(torch.lerp(light, self._layer(light, ids), hidden))
+
+    def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
+        """Light of the layer on Gaussians."""
+        sky = self.answer.exposure.sky[ids, None].to(under).sqrt()  # a bright surrounding fills in
+        sheltered = torch.tensor(SHELTERED_LIGHT).to(under)
+        relief = 1 - RELIEF + RELIEF * (luminance(under)[:, None] / MIDDLE).clamp_max(1.5)
+        return (
+            linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
+            * relief
+            * torch.lerp(sheltered, torch.ones_like(sheltered), sky)
+        )
+
+    def _in_weather(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], ambience: Ambience) -> Float[Tensor, "m 3"]:
+        share = self.share
+        factor = 1 + share * (2.0**ambience.stops * torch.tensor(ambience.tint).to(light) - 1)
+        light = saturated(light * factor, 1 + share * (ambience.saturation - 1))
+        if self.answer.softening is None:
+            return light
+        return light * (1 + share * (self.answer.softening[ids, None].to(light) - 1))
+
+    def _mirror(self, ids: Int[Tensor, "m"], towards: Float[Tensor, "m 3"], ambience: Ambience) -> Float[Tensor, "m 3"]:
+        exposure = self.answer.exposure
+        cosine = (exposure.normals[ids].to(towards) * towards).sum(1)
+        smooth = SMOOTH * exposure.level[ids].to(towards) ** 2
+        sky = linear(torch.tensor(ambience.sky).to(towards))
+        return (smooth * mirrored(cosine) * (cosine > 0) * exposure.sky[ids].to(towards))[:, None] * sky
+
+
+def _mapped(record: R, change: Callable[[Tensor], Tensor]) -> R:
+    """A dataclass with all of its tensors changed."""
+    found = {f.name: getattr(record, f.name) for f in fields(record)}  # type: ignore[arg-type]
+    return replace(record, **{name: change(value) for name, value in found.items() if isinstance(value, Tensor)})  # type: ignore[type-var]
+
+
+def baked(shown: Shown | None, frozen: Gaussians) -> Gaussians:
+    """The frozen scene of a moment as a set of its own, for files: without mirror and air, which depend on the camera."""
+    if shown is None:
+        return frozen
+    frozen = shown.altered(frozen)
+    constant = 0.5 + SH_C0 * frozen.colors[:, 0]
+    after = shown.lit(constant, torch.arange(len(frozen), device=frozen.device), None)
+    dimmed = luminance(after.clamp_min(0)) / luminance(constant.clamp_min(0)).clamp_min(1e-3)
+    left = dimmed.clamp(0, 1) * (1 - shown.hidden.to(after))
+    bands = [((after - 0.5) / SH_C0)[:, None], frozen.colors[:, 1:] * left[:, None, None]]
+    return replace(frozen, colors=torch.cat(bands, dim=1))

@@ -1,0 +1,428 @@
+"""What an image editor made of the training views, as a change of the frozen scene.
+
+The paper fine-tunes the background on pictures of it under snow: 1000 iterations over scale, opacity and colour of its
+Gaussians, which are then interpolated over time. Here the same three quantities are fitted, but as a change that is kept beside
+the scene: the scene's own tensors stay as they are, and any share of the change can be shown. Loss and rates of learning are
+those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023), eq. 7.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, view_colors
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
+
+Picture = tuple[int, UInt8[Tensor, "h w 3"]]
+"""Index of the scene's camera, and what the editor made of its view."""
+
+RATES = {"rgb": 0.01, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
+LAST_RATE = 0.1  # share of the first that is left at the last step
+BOUNDS = {"rgb": 1.0, "logit": 6.0, "log_scale": 1.5}  # largest change of either sign
+HOLD = {"logit": 1e-3, "log_scale": 1e-2}  # pixels wrong by 1 that a change of 1 squared costs, for each Gaussian
+SIMILARITY = 0.2  # share of structural similarity in the loss
+SEEN = 0.02  # pixels that a Gaussian must light up in one of the views; what shows less is not judged by them
+STEADY = 0.02  # pixels; Adam's eps: what shows less is moved in proportion, not at the full rate
+LEAST_SIDE = 16  # pixels; structural similarity looks at 11 at once
+CPU_SIDE = 256  # pixels of the longer side of the pictures on a CPU
+STORE_EVERY = 50  # steps that an interruption may cost
+MAX_SKIPPED = 5  # steps in a row that may pass without a gradient
+MOMENTS = ("exp_avg", "exp_avg_sq")  # what Adam keeps of each number
+_REVISION = 1  # of what is fitted; what an earlier revision has stored is not used
+
+console = Console(stderr=True, highlight=False)
+
+
+@dataclass(frozen=True)
+class Edits:
+    """A change of n Gaussians; zero leaves them as they are."""
+
+    rgb: Float[Tensor, "n 3"]
+    """Added to plain RGB."""
+    logit: Float[Tensor, "n"]
+    """Added to the logit of the opacity."""
+    log_scale: Float[Tensor, "n 3"]
+    """Added to the logarithms of the scales."""
+
+    def __post_init__(self) -> None:
+        n = self.rgb.shape[0]
+        for name, shape in {"rgb": (n, 3), "logit": (n,), "log_scale": (n, 3)}.items():
+            if (found := tuple(getattr(self, name).shape)) != shape:
+                raise ValueError(f"Edits.{name} must have shape {shape}, found {found}")
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0]
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def to(self, device: torch.device | str) -> Edits:
+        return Edits(**{name: tensor.to(device) for name, tensor in self.tensors.items()})
+
+    def select(self, which: Tensor) -> Edits:
+        """The change of the chosen Gaussians, by mask or by index."""
+        return Edits(**{name: tensor[which] for name, tensor in self.tensors.items()})
+
+    def applied(self, gaussians: Gaussians, share: Float[Tensor, "n"] | float) -> Gaussians:
+        """The Gaussians with a share of the change, one for all or one for each; differentiable.
+
+        Share 0 gives the same values bit for bit, share 1 the look that was fitted. Opacities change by their logits, scales
+        by their logarithms, so that neither leaves its range at any share.
+
+        Raises:
+            ValueError: the change is one of another number of Gaussians, or the shares are.
+        """
+        if len(gaussians) != len(self):
+            raise ValueError(f"this change is one of {len(self):,} Gaussians, found {len(gaussians):,}")
+        if not isinstance(share, Tensor):
+            return gaussians if share == 0 else self._added(gaussians, share)
+        if tuple(share.shape) != (len(self),):
+            raise ValueError(f"expected one share for each of the {len(self):,} Gaussians, found shape {tuple(share.shape)}")
+        share = share.to(gaussians.means)
+        edited, still = self._added(gaussians, share), share == 0
+        kept = {
+            name: torch.where(still.view(-1, *[1] * (tensor.ndim - 1)), tensor, getattr(edited, name))
+            for name, tensor in gaussians.tensors.items()
+            if name in ("colors", "opacities", "scales")
+        }
+        return replace(gaussians, **kept)
+
+    def _added(self, gaussians: Gaussians, share: Tensor | float) -> Gaussians:
+        rows = share[:, None] if isinstance(share, Tensor) else share
+        rgb, logit, log_scale = (tensor.to(gaussians.means) for tensor in self.tensors.values())
+        if gaussians.sh_degree is None:
+            colors = gaussians.colors + rgb * rows
+        else:
+            constant = gaussians.colors[:, :1] + (rgb * rows / SH_C0)[:, None]
+            colors = torch.cat([constant, gaussians.colors[:, 1:]], dim=1)
+        # sigmoid(logit(o) + x) without logarithms: exact where x = 0, and where o is 0 or 1; 80 keeps the odds finite.
+        odds = (logit * share).clamp(-80, 80).exp()
+        opacities = gaussians.opacities * odds / (1 + gaussians.opacities * (odds - 1))
+        return replace(gaussians, colors=colors, opacities=opacities, scales=gaussians.scales * (log_scale * rows).exp())
+
+    def save(self, path: Path, key: str) -> None:
+        """Write one safetensors file, atomically, marked with what it was made from (`edits_key`).
+
+        Raises:
+            OSError: the file could not be written.
+        """
+        save_tensors(path, self.tensors, {"key": key})
+
+    @staticmethod
+    def load(path: Path, key: str) -> Edits | None:
+        """A stored change; None where there is none, it is damaged, or was made from something else."""
+        stored = load_tensors(path)
+        if stored is None or stored[1].get("key") != key or set(stored[0]) != {f.name for f in fields(Edits)}:
+            return None
+        return Edits(**stored[0])
+
+
+def read_edited(folder: Path, scene: Scene) -> list[Picture]:
+    """The edited pictures in a folder, in the order of the views they show and in the size of the cameras.
+
+    A picture carries the name of its photograph, whatever the suffix (frame_00012.png for images/frame_00012.jpg); where the
+    scene has no photographs, the one number in its name is the index of the view. Pictures of any other size are stretched to
+    that of the camera. What belongs to no view is left out, with a note.
+
+    Raises:
+        ValueError: there is no such folder, no picture in it belongs to a view, a picture cannot be read, or two show one view.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ValueError(
+            f"edited pictures lie in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
+        )
+    kinds = Image.registered_extensions()
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in kinds and not p.name.startswith(".") and p.is_file())
+    found: dict[int, Path] = {}
+    strangers = []
+    for file in files:
+        index = _view_of(file.stem, scene)
+        if index is None:
+            strangers.append(file.name)
+        elif index in found:
+            raise ValueError(f"{found[index].name} and {file.name} in {folder} both show view {index}; keep one of them")
+        else:
+            found[index] = file
+    if not found:
+        expected = [f"{path.stem}.png" for path in scene.images] or [f"view_{i:04d}.png" for i in range(len(scene.cameras))]
+        there = f"found {len(files)} pictures, such as {files[0].name}" if files else "found no pictures at all"
+        raise ValueError(
+            f"no picture in {folder} belongs to one of the {len(scene.cameras)} views: expected names such as "
+            f"{' and '.join(expected[:2])}, {there}"
+        )
+    if strangers:
+        note = f"{len(strangers)} of the {len(files)} pictures in {folder} belong to no view, such as {strangers[0]}"
+        console.print(f"[yellow]{note}[/]", soft_wrap=True)
+    size = (scene.cameras.width, scene.cameras.height)
+    return [(index, _read_picture(found[index], size)) for index in sorted(found)]
+
+
+def _view_of(stem: str, scene: Scene) -> int | None:
+    """The view that a picture's name stands for, None where it stands for none or for several."""
+    if scene.images:
+        same = [index for index, path in enumerate(scene.images) if path.stem == stem]
+    else:
+        numbers = [int(digits) for digits in re.findall(r"\d+", stem)]
+        same = numbers if len(numbers) == 1 and numbers[0] < len(scene.cameras) else []
+    return same[0] if len(same) == 1 else None
+
+
+def _read_picture(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
+    try:
+        with Image.open(path) as stored:
+            picture = stored.convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"the edited picture {path} cannot be read ({error}): write it again as .png or .jpg") from error
+    resized = picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS)
+    return torch.from_numpy(np.array(resized))
+
+
+def edits_key(scene: Scene, pictures: Sequence[Picture], *, steps: int = 1000, seed: int = 0, side: int | None = None) -> str:
+    """Hash of everything that a change is fitted from."""
+    return content_key("edits", _REVISION, scene.gaussians, scene.cameras, list(pictures), steps, seed, side)
+
+
+def fit_edits(
+    scene: Scene,
+    pictures: Sequence[Picture],
+    *,
+    steps: int = 1000,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    side: int | None = None,
+    progress: bool = True,
+    resume: Path | None = None,
+) -> Edits:
+    """The change that makes the scene look like the pictures; zero for every Gaussian that none of their views shows.
+
+    Args:
+        steps: one of the views each, every view once before any comes again.
+        side: pixels of the longer side of the pictures at work; None: CPU_SIDE on a CPU, as they are with CUDA.
+        progress: show a bar.
+        resume: file that keeps where the fit stands, every STORE_EVERY steps until it is complete; a fit that was broken off
+            goes on from there and ends with the same bits (on a CPU, and with as many threads).
+
+    Raises:
+        ValueError: there are no pictures, one is of no view or not uint8 in the size of the cameras, no Gaussian is seen in
+            them, or `steps` or `side` is too small.
+        FloatingPointError: several steps in a row gave no finite gradient.
+    """
+    _check(scene, pictures, steps, side)
+    device = torch.device(device)
+    if side is None and device.type == "cpu":
+        side = CPU_SIDE
+    key = edits_key(scene, pictures, steps=steps, seed=seed, side=side)
+    gaussians = scene.gaussians.detach().to(device)
+    with _bar(progress) as bar:
+        looking = bar.add_task("looking at the views", total=len(pictures), loss="")
+        views = _Views.of(gaussians, scene.cameras, pictures, side, lambda: bar.advance(looking))
+        fit = _Fit(gaussians, views)
+        if resume is not None:
+            fit.restore(resume, key)
+        fitting = bar.add_task("fitting the edited views", total=steps, completed=fit.done, loss="")
+        while fit.done < steps:
+            loss = fit.step(_view_at(fit.done, len(pictures), seed), LAST_RATE ** (fit.done / steps))
+            bar.update(fitting, completed=fit.done, loss=f"loss {loss:.4f}")
+            if resume is not None and fit.done % STORE_EVERY == 0 and fit.done < steps and not fit.store(resume, key):
+                console.print(f"[yellow]could not store step {fit.done} in {resume}: going on[/]", soft_wrap=True)
+                resume = None
+    if fit.skipped:
+        console.print(f"[yellow]{fit.skipped} of {steps} steps had no finite gradient and changed nothing[/]")
+    if resume is not None:
+        resume.unlink(missing_ok=True)
+    return fit.edits(len(gaussians)).to("cpu")
+
+
+def _check(scene: Scene, pictures: Sequence[Picture], steps: int, side: int | None) -> None:
+    if not pictures:
+        raise ValueError("a change is fitted to at least one edited picture, found none")
+    if steps < 1 or (side is not None and side < LEAST_SIDE):
+        raise ValueError(f"steps must be at least 1 and side at least {LEAST_SIDE} pixels, found steps={steps}, side={side}")
+    for index, picture in pictures:
+        if not 0 <= index < len(scene.cameras):
+            raise ValueError(f"the scene has the views 0 to {len(scene.cameras) - 1}, found a picture of view {index}")
+        expected = [scene.cameras.height, scene.cameras.width, 3]
+        if picture.dtype != torch.uint8 or list(picture.shape) != expected:
+            raise ValueError(
+                f"the picture of view {index} must be uint8 {expected}, found {picture.dtype} {list(picture.shape)}"
+            )
+
+
+def _view_at(step: int, count: int, seed: int) -> int:
+    """The view of a step: all in random order, then all in another; a function of seed and step, so nothing need be kept."""
+    generator = torch.Generator().manual_seed(seed + 1_000_003 * (step // count))
+    return int(torch.randperm(count, generator=generator)[step % count])
+
+
+@dataclass(frozen=True)
+class _Views:
+    """The edited views in the size they are worked on in."""
+
+    cameras: Cameras
+    targets: list[Float[Tensor, "h w 3"]]
+    """Half precision, on the CPU."""
+    seen: Bool[Tensor, "n"]
+    """The Gaussians that light up at least SEEN pixels in one of them."""
+
+    @staticmethod
+    def of(
+        gaussians: Gaussians, cameras: Cameras, pictures: Sequence[Picture], side: int | None, advance: Callable[[], object]
+    ) -> _Views:
+        cameras = cameras[torch.tensor([index for index, _ in pictures])]
+        small = _shrunk(cameras, side)
+        most, targets = torch.zeros(len(gaussians), device=gaussians.device), []
+        rasterizer = choose_rasterizer(Gaussians.empty(), gaussians.device)
+        for k, (_, picture) in enumerate(pictures):
+            target = picture.to(gaussians.device) / 255
+            colors = view_colors(gaussians.colors, gaussians.means, small.viewmats[k]).clone().requires_grad_()
+            shown = rasterizer.render(small[k], replace(gaussians, colors=colors)).rgb[0]
+            # What a picture gains with a Gaussian's red is the light that comes from it.
+            (light,) = torch.autograd.grad(shown[..., 0].sum(), colors)
+            most = torch.maximum(most, light[:, 0])
+            if small.width != cameras.width:
+                # Gaussians look wider where pixels are larger. So that this is not taken for an edit, the small picture is
+                # that of the scene and what the editor changed.
+                with torch.no_grad():
+                    change = target - rasterizer.render(cameras[k], gaussians).rgb[0]
+                target = shown.detach() + _averaged(change, small.width, small.height)
+            targets.append(target.half().cpu())
+            advance()
+        return _Views(small, targets, most >= SEEN)
+
+
+def _shrunk(cameras: Cameras, side: int | None) -> Cameras:
+    """The same views with at most `side` pixels along the longer side, whole: less than a pixel is lost by stretching."""
+    zoom = 1.0 if side is None else min(1.0, side / max(cameras.width, cameras.height))
+    width, height = (max(LEAST_SIDE, round(zoom * length)) for length in (cameras.width, cameras.height))
+    stretch = torch.tensor([width / cameras.width, height / cameras.height, 1.0])
+    return Cameras(cameras.viewmats, cameras.Ks * stretch.to(cameras.Ks)[:, None], width, height)
+
+
+def _averaged(picture: Float[Tensor, "h w 3"], width: int, height: int) -> Float[Tensor, "height width 3"]:
+    small = torch.nn.functional.interpolate(picture.permute(2, 0, 1)[None], (height, width), mode="area")
+    return small[0].permute(1, 2, 0)
+
+
+class _Fit:
+    """The descent: a change of those Gaussians that are seen, among the others."""
+
+    def __init__(self, gaussians: Gaussians, views: _Views) -> None:
+        self.views = views
+        self.ids = views.seen.nonzero()[:, 0]
+        if len(self.ids) == 0:
+            raise ValueError(f"none of the {len(gaussians):,} Gaussians is seen in the {len(views.cameras)} edited views")
+        self.scene = gaussians.select(self.ids)
+        self.rasterizer = choose_rasterizer(gaussians.select(~views.seen), gaussians.device)
+        shapes = {"rgb": (3,), "logit": (), "log_scale": (3,)}
+        self.change = {
+            name: torch.zeros(len(self.ids), *shape, device=gaussians.device, requires_grad=True)
+            for name, shape in shapes.items()
+        }
+        groups = [{"params": [tensor], "name": name} for name, tensor in self.change.items()]
+        self.optimizer = torch.optim.Adam(groups, eps=STEADY, fused=True)
+        self.done = self.skipped = self.in_a_row = 0
+
+    def step(self, view: int, rate: float) -> float:
+        """Descend by one view at a share of the full rates; returns its loss."""
+        edited = Edits(**self.change).applied(self.scene, 1.0)
+        shown = self.rasterizer.render(self.views.cameras[view], edited).rgb[0]
+        loss = difference(shown, self.views.targets[view].to(shown))
+        held = sum(weight * self.change[name].square().sum() for name, weight in HOLD.items())
+        self.optimizer.zero_grad()
+        (loss * shown[..., 0].numel() + held).backward()
+        self.done += 1
+        if self._finite():
+            for group in self.optimizer.param_groups:
+                group["lr"] = RATES[group["name"]] * rate
+            self.optimizer.step()
+            self._bound()
+        return float(loss.detach())
+
+    def _finite(self) -> bool:
+        """Whether the gradient is finite; counts if it is not.
+
+        Raises:
+            FloatingPointError: it was not, several times in a row.
+        """
+        sums = torch.stack([tensor.grad.sum() for tensor in self.change.values() if tensor.grad is not None])
+        if torch.isfinite(sums).all():
+            self.in_a_row = 0
+            return True
+        self.skipped, self.in_a_row = self.skipped + 1, self.in_a_row + 1
+        if self.in_a_row == MAX_SKIPPED:
+            raise FloatingPointError(
+                f"the gradient of the edited views was NaN or infinite in {MAX_SKIPPED} steps in a row, up to step {self.done}"
+            )
+        return False
+
+    @torch.no_grad()
+    def _bound(self) -> None:
+        for name, tensor in self.change.items():
+            tensor.clamp_(-BOUNDS[name], BOUNDS[name])
+
+    def edits(self, count: int) -> Edits:
+        """The change of all `count` Gaussians of the scene: of those that are not seen, zero."""
+        found = {}
+        for name, tensor in self.change.items():
+            found[name] = tensor.new_zeros(count, *tensor.shape[1:])
+            found[name][self.ids] = tensor.detach()
+        return Edits(**found)
+
+    def store(self, path: Path, key: str) -> bool:
+        """Keep where the fit stands; False where the disk does not take it."""
+        tensors = dict(self.change)
+        for name, tensor in self.change.items():
+            moments = self.optimizer.state[tensor]
+            tensors |= {f"{name}.{moment}": moments.get(moment, torch.zeros_like(tensor)) for moment in MOMENTS}
+        numbers = {"done": self.done, "skipped": self.skipped, "in_a_row": self.in_a_row}
+        with suppress(OSError):
+            save_tensors(path, tensors, {"key": key, **numbers})
+            return True
+        return False
+
+    @torch.no_grad()
+    def restore(self, path: Path, key: str) -> None:
+        """Go on from what is kept, if it is of the same fit."""
+        stored = load_tensors(path)
+        if stored is None or stored[1].get("key") != key:
+            return
+        tensors, about = stored
+        self.done, self.skipped, self.in_a_row = (about[name] for name in ("done", "skipped", "in_a_row"))
+        for name, tensor in self.change.items():
+            tensor.copy_(tensors[name])
+            moments = {moment: tensors[f"{name}.{moment}"].to(tensor) for moment in MOMENTS}
+            steps = torch.tensor(float(self.done - self.skipped), device=tensor.device)
+            self.optimizer.state[tensor] = {"step": steps, **moments}
+
+
+def difference(shown: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean absolute difference of the pixels, with a share of structural dissimilarity; 0 for equal pictures."""
+    from torchmetrics.functional.image import structural_similarity_index_measure as similarity  # takes seconds to import
+
+    ours, theirs = (picture.permute(2, 0, 1)[None] for picture in (shown, target))
+    alike = similarity(ours, theirs, data_range=1.0)
+    assert isinstance(alike, Tensor)
+    return (1 - SIMILARITY) * (shown - target).abs().mean() + SIMILARITY * (1 - alike)
+
+
+def _bar(show: bool) -> Progress:
+    counts = BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[loss]}"), TimeElapsedColumn(), TimeRemainingColumn()
+    return Progress(TextColumn("{task.description}"), *counts, console=console, disable=not show, transient=True)

@@ -1,0 +1,118 @@
+"""The answer of a scene to a weather, made once: exposure by rays, the sun by its shadows, haze by the box of air."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from pgsd_nerfstudio.physics.clock import domain_of
+from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
+from pgsd_nerfstudio.response.answer import Answer
+from pgsd_nerfstudio.response.edited import Edits
+from pgsd_nerfstudio.response.exposure import Exposure
+from pgsd_nerfstudio.response.haze import HazeField
+from pgsd_nerfstudio.response.layers import Layers
+from pgsd_nerfstudio.response.light import linear, luminance
+from pgsd_nerfstudio.response.sunlight import find_sunlight, lit, overcast_factor
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.effect import Effect
+
+SOLID = 0.3  # opacity from which a Gaussian's colour is asked for the sun
+_REVISION = 1  # of what is computed; stored answers of another one are not used
+
+
+def answer_of(
+    scene: Scene, surface: SurfaceMesh, effect: Effect, *, seconds: float, seed: int = 0, edits: Edits | None = None
+) -> Answer:
+    """How a scene answers an effect; what is costly is computed once and then read from the cache.
+
+    Args:
+        seconds: length of the weather: when edited pictures are reached.
+
+    Raises:
+        OSError: the cache could not be written.
+    """
+    key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, effect, seed)
+    path = cache_dir() / "answers" / f"{key}.safetensors"
+    answer = stored_answer(path, scene, effect, seconds=seconds, seed=seed, edits=edits)
+    if answer is None:
+        metric = to_metric(scene)
+        exposure = Exposure.of(metric, surface, effect, seed=seed)
+        softening = softening_of(metric, exposure, surface, effect)
+        answer = _answer(scene, effect, exposure, softening, seconds, seed, edits)
+        save_answer(path, answer)
+    return answer
+
+
+def save_answer(path: Path, answer: Answer) -> None:
+    """Store what was computed by rays, for `stored_answer`.
+
+    Raises:
+        OSError: the file could not be written.
+    """
+    tensors = {f.name: getattr(answer.exposure, f.name) for f in fields(Exposure)}
+    if answer.softening is not None:
+        tensors["softening"] = answer.softening
+    save_tensors(path, tensors, {"revision": _REVISION})
+
+
+def stored_answer(
+    path: Path, scene: Scene, effect: Effect, *, seconds: float, seed: int = 0, edits: Edits | None = None
+) -> Answer | None:
+    """The answer of a file; None where there is none, or where it is damaged or of another scene or version."""
+    stored = load_tensors(path)
+    if stored is None or stored[1].get("revision") != _REVISION:
+        return None
+    tensors = stored[0]
+    softening = tensors.pop("softening", None)
+    if set(tensors) != {f.name for f in fields(Exposure)} or len(tensors["sky"]) != len(scene.gaussians):
+        return None
+    return _answer(scene, effect, Exposure(**tensors), softening, seconds, seed, edits)
+
+
+def _answer(
+    scene: Scene,
+    effect: Effect,
+    exposure: Exposure,
+    softening: Float[Tensor, "n"] | None,
+    seconds: float,
+    seed: int,
+    edits: Edits | None,
+) -> Answer:
+    return Answer(
+        effect=effect,
+        exposure=exposure,
+        layers=Layers.of(effect, exposure, scene.frame.to_metric(scene.gaussians.means), seed=seed),
+        softening=softening,
+        up=scene.frame.rotation,
+        metres_per_unit=scene.frame.metres_per_unit,
+        haze=HazeField.of(effect, scene.frame, domain_of(scene), seed=seed),
+        edits=edits,
+        seconds=seconds,
+    )
+
+
+def to_metric(scene: Scene) -> Gaussians:
+    """The frozen Gaussians in metres; plain colours."""
+    frozen = scene.gaussians
+    plain = 0.5 + SH_C0 * (frozen.colors if frozen.colors.ndim == 2 else frozen.colors[:, 0])
+    return scene.frame.gaussians_to_metric(replace(frozen, colors=plain))
+
+
+def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect) -> Float[Tensor, "n"] | None:
+    """Factor on linear light when the ambience's clouds have come; None where they change nothing or no sun is found."""
+    if effect.ambience is None or effect.ambience.clouds == 0:
+        return None
+    light = luminance(linear(metric.colors))
+    asked = ~exposure.loose & (metric.opacities > SOLID)
+    sun = find_sunlight(metric.means[asked], exposure.normals[asked], light[asked], surface)
+    if sun is None:
+        return None
+    seen = lit(sun, metric.means, exposure.normals, surface)
+    return overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds)
