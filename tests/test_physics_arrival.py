@@ -96,7 +96,7 @@ def cameras() -> Cameras:
 
 @pytest.fixture(scope="module")
 def steady() -> ParticleHistory:
-    return run(Spell(), snow_in(0.6))
+    return run(Spell(), snow_in(3.0))
 
 
 @pytest.fixture(scope="module", params=COURSES)
@@ -106,7 +106,7 @@ def spell(request) -> Spell:
 
 @pytest.fixture(scope="module")
 def coming(spell) -> ParticleHistory:
-    return run(spell, snow_in(0.6))
+    return run(spell, snow_in(3.0))
 
 
 @pytest.mark.parametrize("effect", [SNOWFALL, RAINFALL, FOG], ids=lambda e: e.name)

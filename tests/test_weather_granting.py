@@ -26,6 +26,7 @@ from pgsd_nerfstudio.weather import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL,
 from pgsd_nerfstudio.weather.granting import granted, remarks
 from pgsd_nerfstudio.weather.matter import INTENSITIES
 from pgsd_nerfstudio.weather.reader import read
+from pgsd_nerfstudio.weather.spell import Spell
 from pgsd_nerfstudio.weather.vocabulary import KINDS
 from pgsd_nerfstudio.weather.wish import BASES, LIMITS, Wish
 
@@ -344,7 +345,7 @@ def test_particles_that_shall_not_gather_vanish_where_they_land():
     floor = SurfaceMesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
     domain, clock = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 2.0)), Clock(fps=25.0, frames=40)
     for base, accumulates in product((SNOWFALL, SANDSTORM), (None, False)):
-        effect = granted(wish(base.name, accumulates=accumulates))
+        effect = replace(granted(wish(base.name, accumulates=accumulates)), spell=Spell())  # all at once
         about = (history := simulate(floor, effect, clock, domain, max_particles=400, progress=False)).about
         landed, vanished = ("absorbed", "landed") if accumulates is False else ("landed", "absorbed")
         assert about[landed] > 50 and about[vanished] == 0

@@ -4,9 +4,9 @@ Along a ray, light of colour c from distance d arrives as c T + A (1 - T), T = e
 1924; Beer-Lambert). Blending is linear, so it is exact for splats to let each Gaussian's colour through the air by itself, from
 its centre on, and to blend afterwards: every rasterizer shows it, as none knows of it.
 
-A medium that differs from place to place is sampled once for each camera, in froxels (Wronski, "Volumetric fog", SIGGRAPH 2014):
-along a fan of rays, in slices that grow with distance. A Gaussian reads its optical depth between the rays, so that the cost
-hardly depends on their number.
+A medium that differs from place to place is sampled once for each camera, in froxels (Wronski, "Volumetric fog", SIGGRAPH
+2014): along a fan of rays, in slices that grow with distance. A Gaussian reads its optical depth between the rays, so that the
+cost hardly depends on their number.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -31,17 +31,23 @@ BEYOND = 100.0  # times the farthest slice: as far as the air of the last slice 
 
 @dataclass(frozen=True, kw_only=True)
 class Froxels:
-    """How finely the air before a camera is sampled, along its rays. Lengths in scene units."""
+    """How finely the air before a camera is sampled, along its rays. Lengths in scene units.
+
+    In patches of 8 m the optical depth is off by 0.6 % (root mean square) within 40 m, more where hardly any light is left:
+    what arrives differs by less than 2 % of the light everywhere.
+    """
 
     nearest: float = 0.4
     """Thickness of the slice at the camera; each is thicker than the one before by the same factor."""
     farthest: float = 400.0
     """Where the last slice ends; beyond, the air goes on as in it."""
     slices: int = 64
-    rays: int = 36
-    """Across the wider side of the image, whatever its size: what counts is how far apart they are in the air. 14 pixels of 512."""
-    margin: float = 0.5
-    """How far the fan reaches beyond each side of the image, in halves of the image; still farther out its edge goes on."""
+    rays: int = 44
+    """Across the wider side of the image, whatever its size: what counts is how far apart they are in the air. At 512 pixels
+    one in 12."""
+    margin: float = 0.3
+    """How far the fan reaches beyond each side of the image, in halves of the image; still farther out its edge goes on. As far
+    as rasterizers project without distortion: of what lies beyond only wide tails come into view."""
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest * self.slices < self.farthest:
@@ -51,12 +57,27 @@ class Froxels:
             )
 
     @cached_property
-    def edges(self) -> Float[Tensor, "s+2"]:
-        """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
+    def growth(self) -> float:
+        """Logarithm of the factor from slice to slice."""
         ratio = self.farthest / self.nearest
-        growth = float(brentq(lambda g: math.log(math.expm1(g * self.slices) / math.expm1(g) / ratio), 1e-9, 600 / self.slices))
-        within = self.nearest / math.expm1(growth) * torch.expm1(growth * torch.arange(self.slices + 1, dtype=torch.float64))
+
+        def excess(growth: float) -> float:
+            return math.log(math.expm1(growth * self.slices) / math.expm1(growth) / ratio)
+
+        return float(root_scalar(excess, bracket=(1e-9, 600 / self.slices)).root)
+
+    def edges(self, like: Tensor) -> Float[Tensor, "s+2"]:
+        """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
+        within = self.nearest / math.expm1(self.growth) * torch.expm1(self.growth * torch.arange(self.slices + 1).to(like))
         return torch.cat([within, BEYOND * within[-1:]])
+
+    def slots(self, distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Where distances lie among the edges, linear within each slice, so that even air is met exactly."""
+        at = torch.log1p(distances * (math.expm1(self.growth) / self.nearest)) / self.growth
+        whole = at.detach().floor()
+        within = whole + torch.expm1(self.growth * (at - whole)) / math.expm1(self.growth)
+        beyond = (distances / self.farthest - 1.0) / (BEYOND - 1.0)
+        return torch.where(at < self.slices, within, self.slices + beyond.clamp(0.0, 1.0))
 
 
 class Medium:
@@ -108,8 +129,8 @@ class Medium:
         if not callable(self.extinction):
             return self._mixed(own, torch.tensor(self.extinction * far).to(own))
         depths = self._depths(viewmat, K, width, height)
-        slot = self._slots(torch.tensor([far]).to(depths))
-        here = int(slot)
+        slot = float(self.froxels.slots(torch.tensor([far], dtype=torch.float64)))
+        here = min(int(slot), len(depths) - 2)
         layer = torch.lerp(depths[here], depths[here + 1], slot - here)
         x, y = (0.5 + torch.arange(side).to(depths) for side in (width, height))
         at = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -126,27 +147,20 @@ class Medium:
     ) -> Float[Tensor, "n"]:
         """The integral of the extinction from the camera's centre to each point; T = exp(-it)."""
         viewmat, K = viewmat.to(means), K.to(means)
-        distances = (means - _center(viewmat)).norm(dim=1)
+        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        distances = points.norm(dim=1)
         if not callable(self.extinction):
             return self.extinction * distances
         depths = self._depths(viewmat, K, width, height)
-        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         # What is beside or behind the camera is not drawn; it only must not divide by zero.
         pixels = points[:, :2] / points[:, 2:].clamp_min(1e-6) * K.diagonal()[:2] + K[:2, 2]
-        along = 2.0 * self._slots(distances) / (len(depths) - 1) - 1.0
+        along = 2.0 * self.froxels.slots(distances) / (len(depths) - 1) - 1.0
         at = torch.cat([self._across(pixels, width, height), along[:, None]], dim=1)
         read = grid_sample(depths[None, None], at[None, :, None, None, :], "bilinear", "border", align_corners=True)
         return read[0, 0, :, 0, 0]
 
     def _mixed(self, rgb: Tensor, depth: Tensor) -> Tensor:
         return rgb * torch.exp(-depth) - self.airlight.to(rgb) * torch.expm1(-depth)
-
-    def _slots(self, distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Where distances lie among the edges of the slices, linear within each: even air is met exactly."""
-        edges = self.froxels.edges.to(distances)
-        slice_of = (torch.searchsorted(edges, distances.detach(), right=True) - 1).clamp(0, len(edges) - 2)
-        start, end = edges[slice_of], edges[slice_of + 1]
-        return slice_of + ((distances - start) / (end - start)).clamp(0.0, 1.0)
 
     def _across(self, pixels: Float[Tensor, "*n 2"], width: int, height: int) -> Float[Tensor, "*n 2"]:
         """Pixels in the fan of rays, -1..1, and no farther."""
@@ -162,7 +176,7 @@ class Medium:
         if self._sampled is not None and _same(self._sampled[0], view):
             return self._sampled[1]
         rays = self._rays(*view)
-        edges = self.froxels.edges.to(rays)
+        edges = self.froxels.edges(rays)
         middles = 0.5 * (edges[:-2] + edges[1:-1])
         points = _center(view[0]) + middles[:, None, None, None] * rays
         assert callable(self.extinction)

@@ -32,7 +32,7 @@ from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
 Picture = tuple[int, UInt8[Tensor, "h w 3"]]
 """Index of the scene's camera, and what the editor made of its view."""
 
-RATES = {"rgb": 0.01, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
+RATES = {"rgb": 0.02, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
 LAST_RATE = 0.1  # share of the first that is left at the last step
 BOUNDS = {"rgb": 1.0, "logit": 6.0, "log_scale": 1.5}  # largest change of either sign
 HOLD = {"logit": 1e-3, "log_scale": 1e-2}  # pixels wrong by 1 that a change of 1 squared costs, for each Gaussian

@@ -91,10 +91,10 @@ def falling_mass(effect: Effect) -> float:
 def rained(effect: Effect, seconds: float) -> float:
     """Seconds of full rain that are still there: W with dW/dt = share of the spell until it ends - W / tau, W(0) = 0."""
     tau, spell = Wetting().drying_seconds, effect.spell
-    steps = max(math.ceil(seconds * STEPS_PER_SECOND), 1)
-    at = np.linspace(0.0, max(seconds, 0.0), steps + 1)
-    coming = np.array([spell.share(t) if t <= spell.ends else 0.0 for t in at])
-    return float(trapezoid(coming * np.exp((at - at[-1]) / tau), at))
+    until = min(max(seconds, 0.0), spell.ends)
+    at = np.linspace(0.0, until, max(math.ceil(until * STEPS_PER_SECOND), 1) + 1)
+    coming = np.array([spell.share(t) for t in at])
+    return float(trapezoid(coming * np.exp((at - seconds) / tau), at))
 
 
 def _uneven(metric: Float[Tensor, "n 3"], seed: int) -> Float[Tensor, "n"]:

@@ -3,8 +3,7 @@
 Wet: water in the pores scatters light forward, so that it goes deeper and comes back more rarely (Twomey, Bohren &
 Mergenthaler, "Reflectance and albedo differences between wet and dry surfaces", 1986). An optically thick medium has the albedo
 a = (1 - s)(1 - 0.139 s) / (1 + 1.17 s) with the similarity parameter s = sqrt((1 - w) / (1 - w g)) (van de Hulst, "Multiple
-Light Scattering" 2, 1980); water leaves absorption as it is and raises s by sqrt((1 - g_dry) / (1 - g_wet)).
-Mirror: Fresnel's reflectance of water after Schlick (1994).
+Light Scattering" 2, 1980); water leaves the single grain's albedo w as it is and raises its asymmetry g.
 """
 
 from __future__ import annotations
@@ -15,9 +14,8 @@ from torch import Tensor
 
 GAMMA = 2.2  # of sRGB, near enough: scenes are lit by factors, not measured
 WATER = 1.33  # index of refraction
-NORMAL_REFLECTANCE = ((WATER - 1) / (WATER + 1)) ** 2
-FORWARD = 2.0
-"""(1 - g_dry) / (1 - g_wet). Theory has up to 5 for grains of quartz all around in water; few surfaces soak so far."""
+DRY_ASYMMETRY, WET_ASYMMETRY = 0.80, 0.92
+"""Of grains in air and in water. Twomey et al. take up to 0.97 for grains with water all around; surfaces soak less."""
 LEAST_GREEN, MOST_GREEN = 0.05, 0.25  # excess of green of linear light, from grey stone with moss to leaves
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
@@ -45,8 +43,9 @@ def saturated(light: Float[Tensor, "n 3"], saturation: float) -> Float[Tensor, "
 
 def wetted(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Diffuse light of soaked surfaces, from that of dry ones under white light of 1 (Twomey, Bohren & Mergenthaler 1986)."""
-    dry = similarity(light.clamp(0.0, 1.0))
-    return thick_albedo((dry * FORWARD**0.5).clamp_max(1.0))
+    squared = similarity(light.clamp(0.0, 1.0)).square()
+    grain = (1 - squared) / (1 - DRY_ASYMMETRY * squared)
+    return thick_albedo(((1 - grain) / (1 - WET_ASYMMETRY * grain)).sqrt())
 
 
 def leafy(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -68,5 +67,9 @@ def similarity(albedo: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def mirrored(cosine: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Share of light that a film of water mirrors, by the cosine of the angle to its normal (Schlick 1994)."""
-    return NORMAL_REFLECTANCE + (1 - NORMAL_REFLECTANCE) * (1 - cosine.clamp(0, 1)) ** 5
+    """Share of unpolarised light that a film of water mirrors, by the cosine of the angle to its normal (Fresnel)."""
+    outside = cosine.clamp(0, 1)
+    inside = (1 - (1 - outside**2) / WATER**2).sqrt()
+    across = (outside - WATER * inside) / (outside + WATER * inside)
+    along = (inside - WATER * outside) / (inside + WATER * outside)
+    return 0.5 * (across**2 + along**2)

@@ -1,8 +1,8 @@
 """Patches of denser and thinner air that drift with the wind: a Gaussian random field with the spectrum of turbulence.
 
-Scalars that turbulence mixes have the energy spectrum E(k) ~ k^(-5/3) (Obukhov 1949, Corrsin 1951), in three dimensions a power of
-k^(-11/3) for each Fourier mode. The modes get random phases and exactly that power, so every draw has the same spectrum and a
-variance of 1, and keeps them while each mode turns at a rate of its own, as those of `physics.wind` do. The logarithm of the
+Scalars that turbulence mixes have the energy spectrum E(k) ~ k^(-5/3) (Obukhov 1949, Corrsin 1951), in three dimensions a power
+of k^(-11/3) for each Fourier mode. The modes get random phases and exactly that power, so every draw has the same spectrum and
+a variance of 1, and keeps them while each mode turns at a rate of its own, as those of `physics.wind` do. The logarithm of the
 density is this field times a deviation; its mean is 1. For each moment the modes are summed once into a periodic texture.
 """
 
@@ -76,16 +76,17 @@ class Patches:
         read = grid_sample(self._texture(seconds, points)[None, None], along, "bilinear", "border", align_corners=True)
         return read[0, 0, :, 0, 0]
 
-    def field(self, seconds: float) -> Float[Tensor, "n n n"]:
+    def field(self, seconds: float, device: torch.device | None = None) -> Float[Tensor, "n n n"]:
         """The Gaussian field at its nodes over x, y, z, not drifted: mean 0, variance 1 as it is read between them."""
-        turned = self.modes * torch.polar(torch.ones_like(self.rates), self.rates * seconds).to(self.modes)
+        modes, rates = self.modes.to(device), self.rates.to(device)
+        turned = modes * torch.polar(torch.ones_like(rates), rates * seconds).to(modes)
         return torch.fft.irfftn(turned, s=(NODES,) * 3, norm="forward")
 
     def _texture(self, seconds: float, like: Tensor) -> Float[Tensor, "n+1 n+1 n+1"]:
         """Density at the nodes, the first layer along each axis once more as its last; that of the last moment is kept."""
         made = self._made[-1] if self._made else None
         if made is None or made[0] != seconds or (made[1].dtype, made[1].device) != (like.dtype, like.device):
-            density = torch.exp(self.deviation * self.field(seconds))
+            density = torch.exp(self.deviation * self.field(seconds, like.device))
             around = pad((density / density.mean())[None, None], (0, 1, 0, 1, 0, 1), mode="circular")[0, 0]
             made = seconds, around.to(like)
             self._made[:] = [made]

@@ -29,17 +29,17 @@ from torch.nn.functional import normalize
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
 
 POINTS, FEWEST = 8000, 400  # whose light is compared, at most and at least
-NEIGHBOURS, PARTNERS = 40, 8  # of a point: how many stand for its surroundings, and with how many of these it is compared
-ALIKE, TURN = 0.8, 0.3  # cosine between normals that are compared; metres that a turn of the normal by one radian counts as
+NEIGHBOURS, PARTNERS = 60, 6  # of a point: how many stand for its surroundings, and with how many of these it is compared
+ALIKE, TURN = 0.8, 1.0  # cosine between normals that are compared; metres that a turn of the normal by one radian counts as
 NEAR = 0.06  # m off the surface, within which a point is taken to lie on it
-DARKEST = 2e-3  # luminance below which a colour says nothing about light
+DARKEST = 5e-3  # of the median luminance: below, a colour says nothing about light
 CANDIDATES, LOWEST = 300, math.sin(math.radians(4.0))  # suns tried first, and the sine of the lowest's elevation
 RIVALS, FINER = 3, (8.0, 3.0)  # suns that are looked at closely, with 24 others within so many degrees of each
 RATIOS = (0.3, 0.7, 1.5, 3.0, 6.0, 12.0)
 STRONGEST = 60.0  # ratio; the clear sky's is 5 to 10
 FOLDS, CELLS = 16, 64  # of equal numbers of points: what is left out at once, and what counts as one observation
 ELSEWHERE = tuple(math.cos(math.radians(angle)) for angle in (35.0, 65.0))  # how far away suns are that must do worse
-CERTAIN = 3.0  # standard errors
+CERTAIN = 3.5  # standard errors
 SKY_RAYS, SUN_RAYS = 64, 8
 SPREAD = 0.02  # rad: the disc is 0.0047, more stands for the coarseness of meshes and Gaussians
 LIFT = (0.004, 0.03)  # m above the surface where rays start; within this, 0.3 of the median edge
@@ -195,9 +195,9 @@ def _yard(
     points: Tensor, normals: Tensor, luminance: Tensor, surface: SurfaceMesh, generator: torch.Generator
 ) -> _Yard | None:
     """A choice of points that covers the surface evenly; None where there are too few, or few lie like their neighbours."""
-    if len(surface.triangles) == 0:
+    if len(surface.triangles) == 0 or len(points) < FEWEST:
         return None
-    useful = torch.nonzero(luminance > DARKEST)[:, 0]
+    useful = torch.nonzero(luminance > DARKEST * luminance.median())[:, 0]
     chosen = useful[_thinned(points[useful], surface.bounds, generator)]
     chosen = chosen[surface.closest(points[chosen]).distance < NEAR][:POINTS]
     if len(chosen) < FEWEST:

@@ -45,8 +45,8 @@ class Knobs:
     A built-in reader understands many words and says which; with --llm a language model is asked, and may be told anything."""
     llm: str | None = None
     """Language model that turns the words into numbers, as PROVIDER:NAME (openai:gpt-4o-mini, anthropic:NAME).
-    Its key comes from the environment (OPENAI_API_KEY, ANTHROPIC_API_KEY, ...). It is asked once and its answer is kept.
-    If it cannot be asked, the built-in reader answers instead and says so."""
+    Needs pip install 'pgsd-nerfstudio[llm]', and its key in the environment (OPENAI_API_KEY, ANTHROPIC_API_KEY, ...).
+    It is asked once and its answer is kept. If it cannot be asked, the built-in reader answers instead and says so."""
     llm_url: str | None = None
     """Address of a server that speaks the protocol of OpenAI or Anthropic, such as http://127.0.0.1:8000/v1 (then vllm:NAME).
     By default the provider's own, or what OPENAI_BASE_URL, ANTHROPIC_BASE_URL, ... say."""
@@ -72,7 +72,7 @@ class Knobs:
     """Seconds within which the weather comes, from a clear start; 0: all of it is there in the first frame.
     By default the effect's own."""
     ends: float | None = None
-    """Second after which nothing new comes. By default it does not end."""
+    """Second after which nothing new comes. By default the effect's own; the built-in ones do not end."""
     accumulation: tyro.conf.FlagConversionOff[bool] = True
     """Whether what lands stays, gathers and wets. False: it vanishes, surfaces stay bare and dry."""
     accumulation_speedup: float | None = None
