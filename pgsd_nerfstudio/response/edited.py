@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, view_colors
+from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, sh_basis, view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
@@ -34,7 +34,7 @@ Picture = tuple[int, UInt8[Tensor, "h w 3"]]
 
 RATES = {"rgb": 0.02, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
 LAST_RATE = 0.1  # share of the first that is left at the last step
-BOUNDS = {"rgb": 1.0, "logit": 6.0, "log_scale": 1.5}  # largest change of either sign
+BOUNDS = {"logit": 6.0, "log_scale": 1.5}  # largest change of either sign
 HOLD = {"logit": 1e-3, "log_scale": 1e-2}  # pixels wrong by 1 that a change of 1 squared costs, for each Gaussian
 SIMILARITY = 0.2  # share of structural similarity in the loss
 SEEN = 0.02  # pixels that a Gaussian must light up in one of the views; what shows less is not judged by them
@@ -343,7 +343,8 @@ class _Fit:
     def step(self, view: int, rate: float) -> float:
         """Descend by one view at a share of the full rates; returns its loss."""
         edited = Edits(**self.change).applied(self.scene, 1.0)
-        shown = self.rasterizer.render(self.views.cameras[view], edited).rgb[0]
+        camera = self.views.cameras[view]
+        shown = self.rasterizer.render(camera, replace(edited, colors=_liftable(edited, camera.viewmats[0]))).rgb[0]
         loss = difference(shown, self.views.targets[view].to(shown))
         held = sum(weight * self.change[name].square().sum() for name, weight in HOLD.items())
         self.optimizer.zero_grad()
@@ -375,8 +376,11 @@ class _Fit:
 
     @torch.no_grad()
     def _bound(self) -> None:
-        for name, tensor in self.change.items():
-            tensor.clamp_(-BOUNDS[name], BOUNDS[name])
+        # A colour without its dependence on the direction goes no further out of 0..1 than it is.
+        constant = SH_C0 * self.scene.colors[:, 0] + 0.5
+        self.change["rgb"].clamp_(-constant.clamp_min(0), (1 - constant).clamp_min(0))
+        for name, bound in BOUNDS.items():
+            self.change[name].clamp_(-bound, bound)
 
     def edits(self, count: int) -> Edits:
         """The change of all `count` Gaussians of the scene: of those that are not seen, zero."""
@@ -411,6 +415,15 @@ class _Fit:
             moments = {moment: tensors[f"{name}.{moment}"].to(tensor) for moment in MOMENTS}
             steps = torch.tensor(float(self.done - self.skipped), device=tensor.device)
             self.optimizer.state[tensor] = {"step": steps, **moments}
+
+
+def _liftable(gaussians: Gaussians, viewmat: Float[Tensor, "4 4"]) -> Float[Tensor, "n 3"]:
+    """`view_colors` with a gradient also where they are cut off at black: a tenth of the Gaussians of a capture are darker than
+    black from some side, and must whiten too."""
+    center = torch.linalg.inv(viewmat.double())[:3, 3].to(gaussians.means)
+    basis = sh_basis(gaussians.sh_degree or 0, torch.nn.functional.normalize(gaussians.means - center, dim=1))
+    colors = torch.einsum("nk,nkc->nc", basis, gaussians.colors) + 0.5
+    return colors + (colors.clamp_min(0) - colors).detach()
 
 
 def difference(shown: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
