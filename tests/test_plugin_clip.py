@@ -13,6 +13,7 @@ from pgsd_nerfstudio.plugin.clip import render_clip, seen_by, surrogate
 from pgsd_nerfstudio.plugin.run_cameras import open_scene
 from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.response.prepare import answer_of
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather import effect, initial_look
@@ -40,8 +41,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     rollout = Rollout(history, initial_look(effect("snowfall"), history), field, look)
     cameras = interpolate(scene.cameras, 0, 1, FRAMES)
     gradient = torch.randn(FRAMES, 3, cameras.height, cameras.width, generator=torch.Generator().manual_seed(1))
+    answer = answer_of(scene, floor, effect("snowfall"), seconds=1.0)
     return SimpleNamespace(
         stage=stage,
+        moments=[answer.at((START + k) / history.fps) for k in range(FRAMES)],
         history=history,
         rollout=rollout,
         cameras=cameras,
@@ -56,9 +59,9 @@ def rolled(world: SimpleNamespace, visible=None) -> list:
 
 
 def test_frame_by_frame_gives_the_gradient_of_the_whole_graph(world: SimpleNamespace):
-    picture = world.stage.rasterizer.render(world.cameras, rolled(world), BACKGROUND).rgb.permute(0, 3, 1, 2)
+    picture = world.stage.rasterizer.render(world.cameras, rolled(world), BACKGROUND, world.moments).rgb.permute(0, 3, 1, 2)
     whole = torch.autograd.grad((picture * world.gradient).sum(), world.learned, allow_unused=True)
-    total, norms = surrogate(world.stage, world.cameras, rolled(world), BACKGROUND, world.gradient)
+    total, norms = surrogate(world.stage, world.cameras, rolled(world), BACKGROUND, world.moments, world.gradient)
     parts = torch.autograd.grad(total, world.learned, allow_unused=True)
     assert sum(g is not None and bool(g.any()) for g in whole) > 10
     for a, b in zip(whole, parts, strict=True):
@@ -68,15 +71,24 @@ def test_frame_by_frame_gives_the_gradient_of_the_whole_graph(world: SimpleNames
     assert all(norm > 0 for norm in norms.values())
 
 
+def test_the_air_of_a_moment_dims_the_gradient_of_what_moves_in_it(world: SimpleNamespace):
+    through, clear = (
+        surrogate(world.stage, world.cameras, rolled(world), BACKGROUND, moments, world.gradient)[1]["colors"]
+        for moments in (world.moments, [None] * FRAMES)
+    )
+    assert all(moment is not None and moment.medium is not None for moment in world.moments)
+    assert 0 < through < clear
+
+
 def test_particles_out_of_sight_change_nothing(world: SimpleNamespace):
     seen = seen_by(world.stage, world.cameras, world.history, START)
     assert 0 < int(seen.sum()) < len(seen)
-    every = render_clip(world.stage, world.cameras, rolled(world), BACKGROUND)
-    some = render_clip(world.stage, world.cameras, rolled(world, seen), BACKGROUND)
+    every = render_clip(world.stage, world.cameras, rolled(world), BACKGROUND, world.moments)
+    some = render_clip(world.stage, world.cameras, rolled(world, seen), BACKGROUND, world.moments)
     assert float((every - some).abs().max()) < 0.02 and float((every - some).square().mean()) < 1e-6
 
 
 def test_a_clip_without_particles_has_a_gradient_of_nothing(world: SimpleNamespace):
     nothing = [one.select(torch.zeros(0, dtype=torch.long)) for one in rolled(world)]
-    total, norms = surrogate(world.stage, world.cameras, nothing, BACKGROUND, world.gradient)
+    total, norms = surrogate(world.stage, world.cameras, nothing, BACKGROUND, world.moments, world.gradient)
     assert float(total) == 0 and not any(norms.values())

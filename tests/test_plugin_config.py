@@ -29,7 +29,9 @@ def scene(tmp_path: Path) -> Path:
 def parse(*arguments: object) -> WeatherTrainerConfig:
     # As ns-train has it: no --flag alone, always --flag True.
     as_nerfstudio = tyro.conf.FlagConversionOff[WeatherTrainerConfig]
-    return tyro.cli(as_nerfstudio, default=pgsd_weather.config, args=[str(a) for a in arguments])
+    config = tyro.cli(as_nerfstudio, default=pgsd_weather.config, args=[str(a) for a in arguments])
+    assert isinstance(config, WeatherTrainerConfig)
+    return config
 
 
 def test_flags_reach_pipeline_data_manager_and_model(scene: Path):

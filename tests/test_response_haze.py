@@ -28,9 +28,11 @@ VIEW = torch.tensor(  # from 1.5 m above the ground towards +y and a little up
 )
 LENS = torch.tensor([[430.0, 0, 256], [0, 430.0, 256], [0, 0, 1]], dtype=torch.float64), 512, 512
 
+INTENSITY = {"fog": 60.0, "sandstorm": 60.0, "rainfall": 12.0, "snowfall": 1.5}
+
 
 def weather(name: str, *, share: float | None = None, spell: Spell | None = None, wind: Wind | None = None, **haze) -> Effect:
-    plain = effect(name)
+    plain = effect(name, intensity=INTENSITY[name])
     emission = plain.emission if share is None else replace(plain.emission, share=share)
     return replace(plain, haze=Haze(**haze), emission=emission, spell=spell or Spell(), wind=wind or plain.wind)
 
@@ -50,7 +52,7 @@ def cube(count: int, side: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", ["fog", "sandstorm"])
 def test_a_fiftieth_of_the_contrast_is_left_at_the_visibility(name):
-    assert math.exp(-full_extinction(weather(name)) * effect(name).emission.intensity) == pytest.approx(0.02)
+    assert math.exp(-full_extinction(weather(name)) * INTENSITY[name]) == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("rate", [1.0, 5.0, 12.0, 25.0, 50.0])
@@ -110,7 +112,7 @@ def test_it_thins_to_a_third_over_the_scale_height_and_not_below_the_ground():
 def test_patches_move_density_about_and_add_none(deviation):
     patches = Patches.draw(deviation, 12.0, (0.0, 0.0, 0.0), turbulence=0.3)
     for seconds in (0.0, 7.0, 200.0):
-        density = patches.density(cube(200_000, patches.period), seconds)
+        density = patches.density(cube(100_000, patches.period), seconds)
         assert density.mean().item() == pytest.approx(1.0, abs=0.01)
         assert density.log().std().item() == pytest.approx(deviation, rel=0.02)
 
@@ -132,10 +134,11 @@ def test_patches_have_the_spectrum_of_a_scalar_in_turbulence():
 def test_at_its_nodes_density_is_the_exponential_of_the_field():
     patches = Patches.draw(0.6, 8.0, (0.0, 0.0, 0.0), turbulence=0.3)
     nodes = torch.tensor([[0, 0, 0], [3, 50, 17], [63, 1, 40], [20, 21, 22]])
-    field = patches.field(6.0)
-    density = patches.density(nodes * (patches.period / len(field)), 6.0)
-    wanted = torch.exp(0.6 * field)
-    torch.testing.assert_close(density, wanted[tuple(nodes.T)] / wanted.mean(), rtol=1e-4, atol=1e-5)
+    for seconds in (6.0, 40.0):
+        field = patches.field(seconds)
+        density = patches.density(nodes * (patches.period / len(field)), seconds)
+        wanted = torch.exp(0.6 * field)
+        torch.testing.assert_close(density, wanted[tuple(nodes.T)] / wanted.mean(), rtol=1e-4, atol=1e-5)
 
 
 def test_patches_repeat_themselves_after_their_period():
@@ -188,9 +191,14 @@ def test_the_same_seed_makes_the_same_patches_and_another_one_others():
     assert (one - other).abs().max() > 0.1
 
 
-@pytest.mark.parametrize(("name", "size"), [("fog", 12.0), ("sandstorm", 15.0), ("snowfall", 20.0)])
-def test_froxels_see_patches_as_a_fine_quadrature_does(name, size):
-    medium = HazeField.of(weather(name, share=0.35, patchiness=0.5, patch_size=size), METRES, BOX).at(3.0)
+@pytest.mark.parametrize(
+    ("name", "deviation", "size", "visibility"),
+    [("fog", 0.5, 8.0, 60.0), ("fog", 1.0, 4.0, 25.0), ("sandstorm", 1.0, 5.0, 40.0), ("sandstorm", 0.5, 20.0, 300.0)],
+)
+def test_froxels_see_patches_as_a_fine_quadrature_does(name, deviation, size, visibility):
+    plain = weather(name, share=0.35, patchiness=deviation, patch_size=size)
+    dense = replace(plain, emission=replace(plain.emission, intensity=visibility))
+    medium = HazeField.of(dense, METRES, BOX).at(3.0)
     assert medium is not None and callable(medium.extinction)
     uniform = cube(300, 1.0)
     flat = (uniform[:, :2] * 512 - 256) / 430
@@ -201,11 +209,11 @@ def test_froxels_see_patches_as_a_fine_quadrature_does(name, size):
     along = medium.extinction((center + ways[:, None] * steps).view(-1, 3)).view(300, 600)
     expected = along.mean(1) * ways.norm(dim=1)
     found = medium.optical_depth(center + ways, VIEW, *LENS)
-    counted = expected > 0.05
+    counted = (expected > 0.05) & (expected < math.log(100.0))
     off = ((found - expected) / expected)[counted].abs()
     assert counted.sum() > 100
-    assert off.square().mean().sqrt() < 0.015
-    assert (torch.exp(-found) - torch.exp(-expected)).abs().max() < 0.02
+    assert off.square().mean().sqrt() < 0.03 * deviation
+    assert (torch.exp(-found) - torch.exp(-expected)).abs().max() < 0.03 * deviation
 
 
 # Parcels of fog.

@@ -19,7 +19,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 LOW, HIGH = np.array([-0.5, -0.4, 0.0]), np.array([0.5, 0.4, 1.2])  # of the box, m
-HALF = 4.0  # of the plane, m
+HALF = 2.5  # of the plane, m
 NOON = Sunlight(direction=(0.6, 0.0, 0.8), ratio=5.0, bounce=0.2, explained=0.1, certainty=9.0)
 
 
@@ -49,7 +49,7 @@ def meets_box(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.maximum(np.minimum(a, b).max(-1), 0.0) < np.maximum(a, b).min(-1) - 1e-9
 
 
-def box_on_plane(ratio: float, sun: np.ndarray, count: int = 7000) -> Lit:
+def box_on_plane(ratio: float, sun: np.ndarray, count: int = 3000) -> Lit:
     """A yard with a box in it: its ground and the box's four sides and top, in patches of albedo, each point speckled."""
     rng = np.random.default_rng(3)
     ground = np.concatenate([rng.uniform(-HALF, HALF, (count, 2)), np.zeros((count, 1))], axis=1)
@@ -108,19 +108,19 @@ def courtyard_sun(courtyard) -> Sunlight:
     return sun
 
 
-@pytest.mark.parametrize(("elevation", "azimuth", "ratio"), [(30.0, 140.0, 5.0), (58.0, -70.0, 2.0)])
-def test_the_shadow_of_a_box_tells_where_the_sun_stands_and_how_strong_it_is(elevation, azimuth, ratio):
+@pytest.mark.parametrize(("elevation", "azimuth", "ratio", "exposure"), [(30.0, 140.0, 5.0, 1.0), (55.0, -70.0, 3.0, 0.002)])
+def test_the_shadow_of_a_box_tells_where_the_sun_stands_and_how_strong_it_is_at_any_exposure(
+    elevation, azimuth, ratio, exposure
+):
     direction = toward(elevation, azimuth)
     yard = box_on_plane(ratio, direction)
-    sun = find_sunlight(*yard)
+    sun = find_sunlight(*yard._replace(luminance=exposure * yard.luminance))
     assert sun is not None and degrees_between(sun, direction) < 4
     assert sun.ratio == pytest.approx(ratio, rel=0.25)
     ground = yard.points[:, 2] == 0
     seen = lit(sun, yard.points, yard.normals, yard.surface)
     shadow = torch.from_numpy(meets_box(yard.points[ground].double().numpy(), direction[None]))
     assert ((seen[ground] < 0.5 * direction[2]) == shadow).float().mean() > 0.985
-    brighter = find_sunlight(yard.points, yard.normals, 3 * yard.luminance, yard.surface)
-    assert brighter is not None and brighter.ratio == pytest.approx(sun.ratio, rel=0.02)
 
 
 def test_a_box_without_a_sun_has_none():
@@ -150,11 +150,9 @@ def test_the_courtyards_shadows_lie_where_they_are(courtyard, courtyard_sun):
         above = torch.cat([points[:, :2], points[:, 2:].clamp_min(0) + 0.02], dim=1)
         blocked.append(torch.isfinite(courtyard.surface.cast(above, ray).distance))
     share = torch.stack(blocked).float().mean(0)
-    clear = (share == 0) | (share == 1)
     seen = lit(courtyard_sun, points, normals, courtyard.surface) > 0.5 * courtyard_sun.direction[2]
-    right = (seen == (share == 0))[clear]
-    assert clear.sum() > 1000 and 0.1 < (share[clear] == 1).float().mean() < 0.9
-    assert right.float().mean() > 0.9
+    assert (share == 1).sum() > 1000 and (share == 0).sum() > 1000
+    assert seen[share == 0].float().mean() > 0.9 and (~seen[share == 1]).float().mean() > 0.9
 
 
 def test_an_overcast_courtyard_has_no_sun(courtyard):
@@ -177,9 +175,9 @@ def test_an_overcast_courtyard_has_no_sun(courtyard):
 def test_open_ground_and_walls_see_their_halves_of_the_sky():
     yard = box_on_plane(1.0, toward(40, 0), count=2000)
     seen = sky_seen(yard.points, yard.normals, yard.surface, rays=256)
-    far = (yard.points[:, 2] == 0) & (yard.points[:, :2].norm(dim=1) > 3.5)
+    far = (yard.points[:, 2] == 0) & (yard.points[:, :2].norm(dim=1) > 2.2)
     wall, top = yard.normals[:, 2] == 0, yard.points[:, 2] > 1.199
-    assert seen[far].min() > 0.96 and seen[top].min() == 1
+    assert seen[far].min() > 0.9 and seen[top].min() == 1
     assert seen[wall].mean().item() == pytest.approx(0.5, abs=0.01)
 
 
@@ -228,5 +226,5 @@ def test_what_does_not_fit_together_is_refused(change, says):
 
 
 def test_clouds_are_a_share():
-    with pytest.raises(ValueError, match="got 1.5"):
+    with pytest.raises(ValueError, match=r"got 1\.5"):
         overcast_factor(NOON, torch.ones(1), torch.ones(1), 1.5)

@@ -198,15 +198,18 @@ def test_no_parcel_of_fog_has_to_be_darker_than_opaque():
         sizes = Sizes.of(effect, 3000.0, effect.emission.most or 0)
         count = sizes.in_air[-1] * 3000.0
         assert count == pytest.approx(effect.emission.most, rel=0.01)
-        # Optical depth in the middle of a parcel, by the extinction it holds and the area it covers.
+        # Optical depth in the middle of a parcel, by its part of the extinction that parcels cause and the area it covers.
         a, b, c = effect.appearance.active.scale_m or (0, 0, 0)
-        depth = extinction(effect.emission) * 3000.0 / count / (2 * np.pi * (a * b * c) ** (2 / 3))
+        depth = effect.emission.share * extinction(effect.emission) * 3000.0 / count / (2 * np.pi * (a * b * c) ** (2 / 3))
         assert depth < 0.6
 
 
 @pytest.mark.parametrize("base", [SNOWFALL, RAINFALL, SANDSTORM])
 def test_the_more_it_glitters_the_more_particles_differ(base):
-    looks = [look(granted(wish(base.name, glitter=share))) for share in (0.0, 0.3, 0.7, 1.0)]
+    # From the same spreads, whatever the effect's own are.
+    alike = replace(base.appearance.active, tone_spread=0.04, opacity=0.8, opacity_spread=0.1)
+    base = replace(base, appearance=replace(base.appearance, active=alike))
+    looks = [look(granted(wish(glitter=share), base=base)) for share in (0.0, 0.3, 0.7, 1.0)]
     for quantity in ("opacity", "rgb"):
         spreads = [float(getattr(each.active, quantity).std(0).min()) for each in looks]
         assert spreads == sorted(set(spreads)), quantity

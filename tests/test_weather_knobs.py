@@ -88,7 +88,8 @@ def test_particles_are_wider_by_the_size():
     wide, own = (each.appearance.active.scale_per_diameter for each in (drop, RAINFALL))
     assert wide == pytest.approx([2 * axis for axis in own])
     # Light as a petal: an enlarged flake has the mass of the flake that it is a copy of.
-    assert turned(size=2.0).material.mass(0.004) == pytest.approx(SNOWFALL.material.mass(0.002))
+    wide_flake, flake = np.array([0.004]), np.array([0.002])
+    assert turned(size=2.0).material.mass(wide_flake) == pytest.approx(SNOWFALL.material.mass(flake))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -203,6 +204,8 @@ def test_factors_of_words_and_knobs_multiply_and_what_is_given_in_a_unit_wins():
     assert effect.emission.intensity == 3.0
     assert "--intensity 3 takes the place of amount 2" in remarks
     assert effect.prompt == wish.prompt
+    # The visibility that is given, in as many parcels as if no word had been said.
+    assert Knobs(weather="dense fog", intensity=FOG.emission.intensity).effect_asked()[0].emission == FOG.emission
 
 
 def test_the_prompt_stays_that_of_effect_or_words():

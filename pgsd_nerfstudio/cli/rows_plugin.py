@@ -113,5 +113,5 @@ def _gradient_error(stage: Stage, rollout: Rollout) -> float:
 
     picture = stage.rasterizer.render(cameras, weather(), background).rgb.permute(0, 3, 1, 2)
     whole = flat((picture * on_clip).sum())
-    parts = flat(surrogate(stage, cameras, weather(), background, on_clip)[0])
+    parts = flat(surrogate(stage, cameras, weather(), background, [None] * FRAMES, on_clip)[0])
     return float((whole - parts).norm() / whole.norm())

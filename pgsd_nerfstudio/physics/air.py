@@ -2,8 +2,8 @@
 where the wind blows.
 
 A weather that comes behind a front is steady weather of which only what lies behind the front is there. So in each frame comes
-what was ahead of the front and is behind it now, drawn from steady air; and what the wind carries out ahead of the front ends. The
-air behind it thus holds what steady air does, whether the wind is faster than the front or slower.
+what was ahead of the front and is behind it now, drawn from steady air; and what the wind carries out ahead of the front ends.
+The air behind it thus holds what steady air does, whether the wind is faster than the front or slower.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Air:
         return self._overtaken(frame) if self.arrival.is_front else self._risen(frame)
 
     def entering(self, gone: Bodies, carry: float, frame: int) -> tuple[Bodies, float]:
-        """New particles: through the top, opposite to where others (`gone`) left through a side, and where the weather arrives."""
+        """New particles: through the top, opposite to where others (`gone`) left through a side, where the weather arrives."""
         if self.arrival.is_over(frame * self.step):
             return Bodies.none(), carry
         rng, time = self.draws(frame), frame * self.step

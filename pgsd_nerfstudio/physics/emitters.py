@@ -1,8 +1,8 @@
 """What comes into the box of air: which sizes, how many, where.
 
 Steady weather is the same everywhere in the air: number density N(D) in the volume, flux N(D) v(D) through the top. So the
-box starts full, is fed at the top, and what the wind blows out at one side comes in at the opposite side as a new particle: no
-wedge stays empty, and nothing is simulated outside of the box.
+box starts full (or fills when the weather comes, see `air`), is fed at the top, and what the wind blows out at one side comes
+in at the opposite side as a new particle: no wedge stays empty, and nothing is simulated outside of the box.
 
 There are far more real particles than can be simulated or seen. A real particle is simulated with a chance that grows with its
 diameter, and then represents 1 / chance of its kind: counts are thinned, water is not.

@@ -26,6 +26,7 @@ from torch.nn.functional import grid_sample, normalize
 Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """Per scene unit, at points in scene units."""
 
+CLOSEST = 2.0  # pixels between rays, at least: small pictures do not show more
 BEYOND = 100.0  # times the farthest slice: as far as the air of the last slice goes on
 
 
@@ -33,8 +34,8 @@ BEYOND = 100.0  # times the farthest slice: as far as the air of the last slice 
 class Froxels:
     """How finely the air before a camera is sampled, along its rays. Lengths in scene units.
 
-    In patches of 8 m the optical depth is off by 0.6 % (root mean square) within 40 m, more where hardly any light is left:
-    what arrives differs by less than 2 % of the light everywhere.
+    In patches of 8 m, whose density deviates by half, the optical depth is off by 1 % (root mean square): what arrives differs
+    by less than 2 % of the light everywhere.
     """
 
     nearest: float = 0.4
@@ -44,7 +45,7 @@ class Froxels:
     slices: int = 64
     rays: int = 44
     """Across the wider side of the image, whatever its size: what counts is how far apart they are in the air. At 512 pixels
-    one in 12."""
+    one in 12; in small pictures fewer, one in 2."""
     margin: float = 0.3
     """How far the fan reaches beyond each side of the image, in halves of the image; still farther out its edge goes on. As far
     as rasterizers project without distortion: of what lies beyond only wide tails come into view."""
@@ -173,8 +174,9 @@ class Medium:
     ) -> Float[Tensor, "s+2 rows columns"]:
         """Optical depth at the edges of the slices along each ray of the fan; that of the last view is kept."""
         view = viewmat.detach(), K.detach(), width, height
-        if self._sampled is not None and _same(self._sampled[0], view):
-            return self._sampled[1]
+        kept = self._sampled  # read once: another thread may put its own view there
+        if kept is not None and _same(kept[0], view):
+            return kept[1]
         rays = self._rays(*view)
         edges = self.froxels.edges(rays)
         middles = 0.5 * (edges[:-2] + edges[1:-1])
@@ -189,7 +191,7 @@ class Medium:
 
     def _rays(self, viewmat: Tensor, K: Tensor, width: int, height: int) -> Float[Tensor, "rows columns 3"]:
         """Unit vectors of the fan in scene axes, from corner to corner."""
-        spacing = max(width, height) / self.froxels.rays
+        spacing = max(max(width, height) / self.froxels.rays, CLOSEST)
         reach = 0.5 * (1.0 + self.froxels.margin)
         x, y = (
             (side * (0.5 + torch.linspace(-reach, reach, math.ceil(2 * reach * side / spacing) + 1)).to(K) - center) / focal

@@ -33,10 +33,11 @@ FAR = 3000.0  # m: where the sky begins, as far as haze is concerned
 OPAQUE_UNDER = 1.5  # a full layer is as opaque as this many more Gaussians in the same place
 WIDER_UNDER = 0.25  # and by so much wider, to close the gaps between blades and stones
 SHELTERED_LIGHT = (0.42, 0.46, 0.55)  # linear light on a layer where no sky is seen, bluish, from all that is bright around
+BLUE_SHADOWS = 0.45  # exponent of the softening with which shadows lose colour
 MIDDLE = 0.18  # linear light of a middle grey
 RELIEF = 0.22  # share of a layer's light that follows the light of what it lies on: its folds are not filled at once
 WAXEN = 0.75  # share of a wet look that leaves do not take on
-SMOOTH = 0.75  # share of what a level film of water would mirror that rough ground does
+SMOOTH = 0.45  # share of what a level film of water would mirror that rough ground does
 
 _numbers = itertools.count()
 R = TypeVar("R")
@@ -188,7 +189,10 @@ class Shown:
         light = saturated(light * factor, 1 + share * (ambience.saturation - 1))
         if self.answer.softening is None:
             return light
-        return light * (1 + share * (self.answer.softening[ids, None].to(light) - 1))
+        softened = 1 + share * (self.answer.softening[ids, None].to(light) - 1)
+        # Shadows are lit by the blue of the sky alone, clouds are white.
+        grey = luminance(light)[:, None]
+        return softened * torch.lerp(grey, light, softened.clamp_min(1.0) ** -BLUE_SHADOWS)
 
     def _mirror(self, ids: Int[Tensor, "m"], towards: Float[Tensor, "m 3"], ambience: Ambience) -> Float[Tensor, "m 3"]:
         exposure = self.answer.exposure

@@ -37,6 +37,7 @@ SEEN_COMING = 60.0  # m ahead of the domain, at most, where a front starts
 FADE_IN = 0.2  # of the onset: a front is not there all at once
 EDGE = 1.0  # m, over which parcels of fog take over from the medium
 FIRST_SLICE = 0.4  # m
+SLICES, RAYS = 64, 44  # along the way and across the image, for patches whose logarithm deviates by 0.5
 RAINDROPS = 0.1e-3, 6e-3  # m, where Marshall & Palmer's law holds; few are larger
 SNOWFLAKES = 1e-3, 12e-3  # m, where Locatelli & Hobbs measured
 OPAQUE = 6.0  # optical depth beyond which nothing is told apart
@@ -201,13 +202,22 @@ class HazeField:
         return gone and self.patches is None and math.isinf(self.scale_height) and self.parcels == 0.0
 
     @property
+    def _deviation(self) -> float:
+        return 0.0 if self.patches is None else self.patches.deviation
+
+    @property
     def _reach(self) -> float:
-        """Metres."""
-        return min(max(OPAQUE / self.extinction, 60.0), 20_000.0)
+        """Metres beyond which nothing is told apart; longer among patches, as most of the air is thinner than its mean."""
+        opaque = OPAQUE / self.extinction * math.exp(0.5 * self._deviation**2)
+        return min(max(opaque, 60.0), 20_000.0)
 
     def _froxels(self) -> Froxels:
         unit = self.frame.metres_per_unit
-        return Froxels(nearest=FIRST_SLICE / unit, farthest=self._reach / unit)
+        # What is off grows with the contrast of the patches, and falls with the square of how far apart the samples are.
+        finer = max(1.0, self._deviation / 0.5) ** 0.3
+        return Froxels(
+            nearest=FIRST_SLICE / unit, farthest=self._reach / unit, slices=round(SLICES * finer), rays=round(RAYS * finer)
+        )
 
 
 def _extent(domain: Domain, along: tuple[float, float]) -> tuple[float, float]:

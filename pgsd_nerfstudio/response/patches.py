@@ -35,7 +35,7 @@ class Patches:
     """Standard deviation of the logarithm of the density."""
     wind: tuple[float, float, float]
     """Carries all of it, m/s."""
-    _made: list[tuple[float, Tensor]] = field(default_factory=list, repr=False)
+    _made: list[tuple[float, Tensor]] = field(default_factory=list, init=False, repr=False)
 
     @staticmethod
     def draw(

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.clock import domain_of
@@ -24,6 +26,8 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.effect import Effect
 
 SOLID = 0.3  # opacity from which a Gaussian's colour is asked for the sun
+NEIGHBOURS = 16
+MOST_SOFTENING = 3.0  # a shadow's colours hold noise and bounced light, which would shine
 _REVISION = 1  # of what is computed; stored answers of another one are not used
 
 
@@ -115,4 +119,7 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     if sun is None:
         return None
     seen = lit(sun, metric.means, exposure.normals, surface)
-    return overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds)
+    factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
+    # Shadows of a mesh lie some centimetres beside those of the picture: what neighbours share leaves no bright rims.
+    _, around = cKDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
+    return factor.log()[torch.from_numpy(around).reshape(len(factor), -1)].mean(1).exp()

@@ -1,15 +1,16 @@
 """Where the sun stood when a scene was captured, how strong it was, and what clouds make of the shadows it left.
 
-The light on a matt surface: s = A + g.B + b (1 - A) + r c, in units of a uniform sky's irradiance on open level ground. A is the
+Light on a matt surface: s = A + g.B + b (1 - A) + r c, in units of a uniform sky's irradiance on open level ground. A is the
 cosine-weighted share of the hemisphere that is open sky, B the mean direction of that open part (a sky that brightens towards
 some side or height), b what comes from the surfaces around, c the cosine towards the sun where no surface is in its way. Colour
 is albedo times s. Albedo is unknown, but neighbours that lie alike often share it: differences of log luminance between them
 are compared with those of log s, under the bounded loss of Geman & McClure (1987), e^2 / (e^2 + w^2), to which the edge of a
 paving stone is no more than one miss.
 
-The sun is searched over the sky by the shadows it would cast, and believed only if directions found without a sixteenth of the
-ground foretell the shadows there: better than the best sky without a sun, and better than any sun some 50 degrees away.
-Overcast skies, rooms and chance patterns of albedo do not pass that.
+The sun is searched over the sky by the shadows it would cast. It is judged by how well directions found without a sixteenth of
+the ground foretell what lies there, and believed only if that beats the best sky without a sun, and stands out from what suns
+elsewhere in the sky achieve: their shadows lie like the true ones, but in the wrong places, as chance would have it. Overcast
+skies, rooms and patterns of albedo do not pass.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from torch.nn.functional import normalize
 
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
 
-POINTS, FEWEST = 8000, 400  # whose light is compared, at most and at least
+POINTS, FEWEST = 6000, 400  # whose light is compared, at most and at least
 NEIGHBOURS, PARTNERS = 60, 6  # of a point: how many stand for its surroundings, and with how many of these it is compared
 ALIKE, TURN = 0.8, 1.0  # cosine between normals that are compared; metres that a turn of the normal by one radian counts as
 NEAR = 0.06  # m off the surface, within which a point is taken to lie on it
 DARKEST = 5e-3  # of the median luminance: below, a colour says nothing about light
 CANDIDATES, LOWEST = 300, math.sin(math.radians(4.0))  # suns tried first, and the sine of the lowest's elevation
 RIVALS, FINER = 3, (8.0, 3.0)  # suns that are looked at closely, with 24 others within so many degrees of each
-RATIOS = (0.3, 0.7, 1.5, 3.0, 6.0, 12.0)
+RATIOS = (0.4, 1.2, 3.6, 10.8)
 STRONGEST = 60.0  # ratio; the clear sky's is 5 to 10
 FOLDS, CELLS = 16, 64  # of equal numbers of points: what is left out at once, and what counts as one observation
-ELSEWHERE = tuple(math.cos(math.radians(angle)) for angle in (35.0, 65.0))  # how far away suns are that must do worse
-CERTAIN = 3.5  # standard errors
+ELSEWHERE = math.cos(math.radians(35.0))  # how far away suns are whose shadows are chance
+PROVEN, CERTAIN = 2.0, 5.0  # standard errors over the sky without a sun; standard deviations over suns elsewhere
 SKY_RAYS, SUN_RAYS = 64, 8
 SPREAD = 0.02  # rad: the disc is 0.0047, more stands for the coarseness of meshes and Gaussians
 LIFT = (0.004, 0.03)  # m above the surface where rays start; within this, 0.3 of the median edge
@@ -60,7 +61,7 @@ class Sunlight:
     """Share of the bounded loss of log-luminance differences between neighbours that the sun removes beyond the best sky
     without one, on ground that was left out; small even in full sun, as most of what differs between neighbours is albedo."""
     certainty: float
-    """By how many standard errors the sun does better than that sky, and than another sun; the smaller of both."""
+    """How far that stands out from what suns elsewhere in the sky achieve, in their standard deviations."""
 
 
 def find_sunlight(
@@ -71,7 +72,7 @@ def find_sunlight(
     *,
     seed: int = 0,
 ) -> Sunlight | None:
-    """The sun whose shadows the colours show; None where they show none (overcast, interior, fewer than 400 points on a surface).
+    """The sun whose shadows the colours show; None where they show none (overcast, interior, too few points).
 
     Luminance that a film's or camera's curve has bent gives the ratio that it looks like after that curve.
 
@@ -91,18 +92,18 @@ def find_sunlight(
     chosen = min(range(len(fits)), key=lambda k: fits[k].loss)
     fit, sun = fits[chosen], directions[best[chosen]]
     without_sun = yard.by_cell(_loss(yard.differences - yard.contrast(sky.light), width))
-    foretold, elsewhere = _foretold(_losses(yard, cosines, fit.ambient, width), directions, sun)
-    certainty = min(_standard_errors(other - foretold) for other in (without_sun, elsewhere))
-    if not certainty > CERTAIN:
+    losses = _losses(yard, cosines, fit.ambient, width)
+    foretold = _foretold(losses)
+    elsewhere = losses[directions @ sun < ELSEWHERE].sum(2).amin(1)
+    certainty = float((elsewhere.mean() - foretold.sum()) / elsewhere.std().clamp_min(1e-12))
+    if not (_standard_errors(without_sun - foretold) > PROVEN and certainty > CERTAIN):
         return None
     x, y, z = (float(v) for v in sun)
     explained = float(1 - foretold.sum() / without_sun.sum())
     return Sunlight((x, y, z), fit.ratio, fit.bounce, explained, certainty)
 
 
-def lit(
-    sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], surface: SurfaceMesh
-) -> Float[Tensor, "n"]:
+def lit(sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Float[Tensor, "n"]:
     """Share of the sun's disc that points (m) see, times the cosine to their normals (unit): 0..1, soft over two degrees."""
     place, normals = _starts(points, normals, surface), normals.detach().float().cpu()
     toward = torch.tensor(sun.direction)
@@ -120,9 +121,7 @@ def sky_seen(
     return _sky(place, normals, surface, rays, torch.Generator().manual_seed(seed))[0].to(points)
 
 
-def overcast_factor(
-    sun: Sunlight, lit: Float[Tensor, "n"], sky_seen: Float[Tensor, "n"], clouds: float
-) -> Float[Tensor, "n"]:
+def overcast_factor(sun: Sunlight, lit: Float[Tensor, "n"], sky_seen: Float[Tensor, "n"], clouds: float) -> Float[Tensor, "n"]:
     """What linear light is multiplied with when `clouds` (0..1) of the direct sun reach the ground as sky light instead.
 
     Open level ground keeps its light, and so does what surfaces throw at each other; `lit` and `sky_seen` as the functions of
@@ -186,14 +185,14 @@ def _checked(points: Tensor, normals: Tensor, luminance: Tensor) -> tuple[Tensor
         if bad := int((~torch.isfinite(values)).sum()):
             raise ValueError(f"{bad} values of the {name} are NaN or infinite")
     if bad := int((luminance < 0).sum()):
-        raise ValueError(f"luminance is linear light and never negative, found {bad} values down to {float(luminance.min()):.3g}")
+        raise ValueError(
+            f"luminance is linear light and never negative, found {bad} values down to {float(luminance.min()):.3g}"
+        )
     points, normals, luminance = (values.detach().float().cpu() for values in (points, normals, luminance))
     return points, normals, luminance
 
 
-def _yard(
-    points: Tensor, normals: Tensor, luminance: Tensor, surface: SurfaceMesh, generator: torch.Generator
-) -> _Yard | None:
+def _yard(points: Tensor, normals: Tensor, luminance: Tensor, surface: SurfaceMesh, generator: torch.Generator) -> _Yard | None:
     """A choice of points that covers the surface evenly; None where there are too few, or few lie like their neighbours."""
     if len(surface.triangles) == 0 or len(points) < FEWEST:
         return None
@@ -218,15 +217,17 @@ def _yard(
 
 
 def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generator: torch.Generator) -> Int[Tensor, "m"]:
-    """At most one point a cube, in random order; cubes so small that there are enough, or that a third of all are left."""
+    """At most one point a cube, in random order; cubes so small that there are enough. Few points are all taken."""
     within = torch.nonzero(((points > bounds[0] - NEAR) & (points < bounds[1] + NEAR)).all(1))[:, 0]
     mixed = within[torch.randperm(len(within), generator=generator)]
+    if len(mixed) <= 1.5 * POINTS:
+        return mixed
     edge = float((bounds[1] - bounds[0]).norm()) / 20
     kept = np.zeros(0, np.int64)
     for _ in range(40):
         cube = torch.floor((points[mixed] - bounds[0]) / edge).long().numpy()
         kept = np.unique(cube, axis=0, return_index=True)[1]
-        if len(kept) >= min(1.5 * POINTS, len(mixed) / 3):
+        if len(kept) >= min(1.5 * POINTS, len(mixed) / 2):
             break
         edge *= 0.85
     return mixed[torch.from_numpy(np.sort(kept))]
@@ -293,9 +294,7 @@ def _losses(
     return torch.stack(losses)
 
 
-def _search(
-    yard: _Yard, surface: SurfaceMesh, width: float
-) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "n d"], list[int]]:
+def _search(yard: _Yard, surface: SurfaceMesh, width: float) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "n d"], list[int]]:
     """All suns tried, their cosines at the points, and which few are the best; under a plain sky."""
     plain = yard.sky + 0.2 * (1 - yard.sky)
 
@@ -325,16 +324,12 @@ def _search(
     return directions, cosines, best
 
 
-def _foretold(
-    losses: Float[Tensor, "d ratios cells"], directions: Float[Tensor, "d 3"], sun: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "cells"], Float[Tensor, "cells"]]:
-    """Losses by cell of suns chosen without the cell's fold, and of the best sun elsewhere, chosen with all of them."""
+def _foretold(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, "cells"]:
+    """Losses by cell of the sun, and ratio, that is best without the cell's fold."""
     choices = losses.flatten(0, 1)
     folds = choices.reshape(len(choices), FOLDS, CELLS // FOLDS)
-    kept = (folds.sum((1, 2))[:, None] - folds.sum(2)).argmin(0)
-    away = directions @ sun
-    others = losses[(away < ELSEWHERE[0]) & (away > ELSEWHERE[1])].flatten(0, 1)
-    return folds[kept, torch.arange(FOLDS)].flatten(), others[others.sum(1).argmin()]
+    chosen = (folds.sum((1, 2))[:, None] - folds.sum(2)).argmin(0)
+    return folds[chosen, torch.arange(FOLDS)].flatten()
 
 
 def _standard_errors(gains: Float[Tensor, "cells"]) -> float:

@@ -15,7 +15,7 @@ from pgsd_nerfstudio.weather.touch import SurfaceResponse
 FOG = register(
     Effect(
         name="fog",
-        emission=Emission(kind="fog droplets", intensity=60.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35),
+        emission=Emission(kind="fog droplets", intensity=25.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35),
         material=Material(mass_milligram=0.5236, mass_exponent=3.0, speed_law="fog"),
         wind=Wind(speed=0.5, gustiness=0.25, turbulence=0.12, flutter=0.0, diffusivity=0.01),
         surface=SurfaceResponse(landing="glides", accumulates=False),
@@ -28,7 +28,7 @@ FOG = register(
                 tone_spread=0.02,
             )
         ),
-        haze=Haze(rgb=(0.80, 0.82, 0.84), patchiness=0.5, patch_size=8.0),
+        haze=Haze(rgb=(0.80, 0.82, 0.84), patchiness=1.0, patch_size=4.0),
         ambience=Ambience(clouds=1.0, stops=-0.1, tint=(0.98, 1.0, 1.03), saturation=0.85, sky=(0.80, 0.82, 0.84)),
         prompt="Dense fog drifts through {scene}, soft patches of mist hide what is far away. Photorealistic, high detail",
         negative_prompt="static, clear air, sunny, distorted, cartoon, low quality",

@@ -170,7 +170,6 @@ class Knobs:
         wish = Wish(
             base=None,
             rgb=rgb,
-            landed_rgb=rgb,
             amount=float(self.amount),
             size=float(self.size),
             accumulates=accumulates,

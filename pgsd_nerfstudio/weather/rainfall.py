@@ -33,7 +33,7 @@ RAINFALL = register(
             exposure=1 / 50,
         ),
         haze=Haze(rgb=(0.62, 0.66, 0.70)),
-        ambience=Ambience(clouds=1.0, stops=-0.5, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),
+        ambience=Ambience(clouds=0.95, stops=-0.3, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),
         prompt="Heavy rain is falling in {scene}, raindrops streak through the air and splash, surfaces are wet and dark. "
         "Photorealistic, high detail",
         negative_prompt="static, no rain, dry, sunny, blurry, distorted, cartoon, low quality",

@@ -17,7 +17,7 @@ QUARTZ = Material(mass_milligram=1.3875, mass_exponent=3.0, speed_law="sand")  #
 SANDSTORM = register(
     Effect(
         name="sandstorm",
-        emission=Emission(kind="sand grains", intensity=60.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
+        emission=Emission(kind="sand grains", intensity=40.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
         spell=Spell(onset=5.0, arrives="as a front"),
@@ -31,23 +31,24 @@ SANDSTORM = register(
             accumulation_speedup=60.0,
             layer_density=1600.0,
             layer_thickness=0.004,
+            hides=0.0015,
         ),
         dense=Dense(matter="sand", young=1e5, friction=0.6),
         appearance=Appearance(
             active=StateLook(
-                scale_m=(0.006, 0.006, 0.006),
-                scale_spread=0.4,
-                opacity=0.9,
-                opacity_spread=0.10,
-                rgb=(0.82, 0.66, 0.44),
-                tone_spread=0.10,
+                scale_m=(0.005, 0.005, 0.005),
+                scale_spread=0.5,
+                opacity=0.97,
+                opacity_spread=0.15,
+                rgb=(0.90, 0.75, 0.53),
+                tone_spread=0.14,
             ),
             collided=StateLook(
-                scale_spread=0.3, opacity=0.6, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
+                scale_spread=0.4, opacity=0.35, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
             ),
-            exposure=1 / 60,
+            exposure=1 / 100,
         ),
-        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.7, patch_size=10.0),
+        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=1.0, patch_size=5.0),
         ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
         prompt="A sandstorm sweeps through {scene}, sand grains fly in the wind, dust hangs in the air and sand settles on "
         "surfaces. Photorealistic, high detail",
