@@ -214,6 +214,7 @@ def test_no_change_can_still_learn():
     edits = Edits(*(torch.zeros(144, *shape, requires_grad=True) for shape in ((3,), (), (3,))))
     found = edits.applied(gaussians, 1.0)
     (found.colors.sum() + found.opacities.sum() + found.scales.sum()).backward()
+    assert edits.rgb.grad is not None and edits.logit.grad is not None and edits.log_scale.grad is not None
     assert torch.allclose(edits.rgb.grad, torch.full((144, 3), 1 / SH_C0))
     assert torch.allclose(edits.logit.grad, gaussians.opacities * (1 - gaussians.opacities), rtol=1e-4)
     assert torch.allclose(edits.log_scale.grad, gaussians.scales)
@@ -248,9 +249,10 @@ def test_the_key_knows_pictures_and_numbers(scene, pictures):
         edits_key(scene, pictures, steps=7),
         edits_key(scene, pictures, seed=1),
         edits_key(scene, pictures, side=32),
+        edits_key(scene, pictures, device="cuda"),  # where the pictures are worked on in their full size
         edits_key(replace(scene, gaussians=whitened(scene.gaussians)), pictures),
     }
-    assert len(keys) == 7 and edits_key(scene, list(pictures)) in keys
+    assert len(keys) == 8 and edits_key(scene, list(pictures)) in keys
 
 
 # --- long work

@@ -73,7 +73,8 @@ def box_on_plane(ratio: float, sun: np.ndarray, count: int = 3000) -> Lit:
     direct[: len(ground)] *= ~meets_box(ground, sun[None])
     patches = rng.normal(0, 0.35, (40, 40, 40))[tuple(np.floor(points / 0.4).astype(int).T + 20)]
     albedo = 0.3 * np.exp(patches + rng.normal(0, 0.25, len(points)))
-    return Lit(*(torch.from_numpy(a).float() for a in (points, normals, albedo * (open_sky + ratio * direct))), yard_mesh())
+    place, facing, luminance = (torch.from_numpy(a).float() for a in (points, normals, albedo * (open_sky + ratio * direct)))
+    return Lit(place, facing, luminance, yard_mesh())
 
 
 def yard_mesh() -> SurfaceMesh:
@@ -135,7 +136,8 @@ def test_the_courtyards_sun_is_as_strong_as_it_was_baked(courtyard_sun):
     """Both as irradiance / pi: SUN_LIGHT is that already, the sky's is the cosine-weighted mean of its radiance."""
     rng = np.random.default_rng(0)
     turn, radius = rng.uniform(0, 2 * np.pi, 40000), np.sqrt(rng.uniform(0, 1, 40000))
-    sky = sky_light(np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], 1)).mean(0)
+    hemisphere = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], 1, dtype=np.float64)
+    sky = sky_light(hemisphere).mean(0)
     assert courtyard_sun.ratio == pytest.approx(SUN_LIGHT @ LUMINANCE / (sky @ LUMINANCE), rel=0.3)
 
 

@@ -2,8 +2,8 @@
 
 The paper fine-tunes the background on pictures of it under snow: 1000 iterations over scale, opacity and colour of its
 Gaussians, which are then interpolated over time. Here the same three quantities are fitted, but as a change that is kept beside
-the scene: the scene's own tensors stay as they are, and any share of the change can be shown. Loss and rates of learning are
-those of Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023), eq. 7.
+the scene: the scene's own tensors stay as they are, and any share of the change can be shown. The loss is that of Kerbl et al.,
+"3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023), eq. 7.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
 Picture = tuple[int, UInt8[Tensor, "h w 3"]]
 """Index of the scene's camera, and what the editor made of its view."""
 
+# Of 3DGS but for the colour, which there moves by 0.0007 a step: too slow to whiten anything dark in 1000 steps.
 RATES = {"rgb": 0.02, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
 LAST_RATE = 0.1  # share of the first that is left at the last step
 BOUNDS = {"logit": 6.0, "log_scale": 1.5}  # largest change of either sign
@@ -195,8 +196,17 @@ def _read_picture(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
     return torch.from_numpy(np.array(resized))
 
 
-def edits_key(scene: Scene, pictures: Sequence[Picture], *, steps: int = 1000, seed: int = 0, side: int | None = None) -> str:
-    """Hash of everything that a change is fitted from."""
+def edits_key(
+    scene: Scene,
+    pictures: Sequence[Picture],
+    *,
+    steps: int = 1000,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    side: int | None = None,
+) -> str:
+    """Hash of everything that a change is fitted from; arguments as for `fit_edits`."""
+    side = CPU_SIDE if side is None and torch.device(device).type == "cpu" else side
     return content_key("edits", _REVISION, scene.gaussians, scene.cameras, list(pictures), steps, seed, side)
 
 
@@ -227,9 +237,8 @@ def fit_edits(
     """
     _check(scene, pictures, steps, side)
     device = torch.device(device)
-    if side is None and device.type == "cpu":
-        side = CPU_SIDE
-    key = edits_key(scene, pictures, steps=steps, seed=seed, side=side)
+    key = edits_key(scene, pictures, steps=steps, seed=seed, device=device, side=side)
+    side = CPU_SIDE if side is None and device.type == "cpu" else side
     gaussians = scene.gaussians.detach().to(device)
     with _bar(progress) as bar:
         looking = bar.add_task("looking at the views", total=len(pictures), loss="")
@@ -247,7 +256,8 @@ def fit_edits(
     if fit.skipped:
         console.print(f"[yellow]{fit.skipped} of {steps} steps had no finite gradient and changed nothing[/]")
     if resume is not None:
-        resume.unlink(missing_ok=True)
+        with suppress(OSError):  # never stored, or of a disk that is gone
+            resume.unlink()
     return fit.edits(len(gaussians)).to("cpu")
 
 

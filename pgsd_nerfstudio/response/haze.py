@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.physics import populations
+from pgsd_nerfstudio.physics.arrival import Arrival
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.rendering.medium import Froxels, Medium
 from pgsd_nerfstudio.response.patches import Patches
@@ -29,11 +29,7 @@ from pgsd_nerfstudio.storage import content_key
 from pgsd_nerfstudio.weather.effect import Effect
 from pgsd_nerfstudio.weather.spell import Spell
 
-if TYPE_CHECKING:
-    from pgsd_nerfstudio.physics.arrival import Arrival
-
 WALL = 5.0  # m, over which a front rises from clear air to all of it
-SEEN_COMING = 60.0  # m ahead of the domain, at most, where a front starts
 FADE_IN = 0.2  # of the onset: a front is not there all at once
 EDGE = 1.0  # m, over which parcels of fog take over from the medium
 FIRST_SLICE = 0.4  # m
@@ -67,15 +63,6 @@ class Front:
     """Where it stands at second 0, in metres along its way."""
     speed: float
     """m/s."""
-
-    @staticmethod
-    def across(domain: Domain, direction_degrees: float, ahead: float, seconds: float) -> Front:
-        """It starts `ahead` metres upwind of the domain and has passed all of it after so many seconds."""
-        angle = math.radians(direction_degrees)
-        along = math.cos(angle), math.sin(angle)
-        near, far = _extent(domain, along)
-        start = near - ahead - WALL / 2
-        return Front(along=along, start=start, speed=(far + WALL / 2 - start) / seconds)
 
     @staticmethod
     def of(arrival: Arrival) -> Front:
@@ -121,22 +108,19 @@ class HazeField:
     """Hash of all that it was made from."""
 
     @staticmethod
-    def of(effect: Effect, frame: Frame, domain: Domain, arrival_front: Front | None = None, *, seed: int = 0) -> HazeField:
+    def of(effect: Effect, frame: Frame, domain: Domain, *, seed: int = 0) -> HazeField:
         """The haze of an effect.
 
         Args:
             effect: its haze may be None: then the air is clear at all times.
             frame: of the scene.
             domain: box of air that the particles are simulated in.
-            arrival_front: a wall of one's own; None: that of the spell, if it arrives as one.
             seed: of the patches.
         """
         haze, wind, spell = effect.haze, effect.wind, effect.spell
         extinction = full_extinction(effect)
-        front, patches = arrival_front, None
-        if front is None and extinction > 0 and spell.arrives == "as a front" and spell.onset > 0:
-            ahead = min(3 * math.log(50.0) / extinction, SEEN_COMING)
-            front = Front.across(domain, wind.direction_degrees, ahead, spell.onset)
+        arrival = Arrival.of(spell, domain, wind)
+        front, patches = Front.of(arrival) if arrival.is_front else None, None
         if haze is not None and haze.patchiness > 0:
             angle = math.radians(wind.direction_degrees)
             drift = wind.speed * math.cos(angle), wind.speed * math.sin(angle), 0.0

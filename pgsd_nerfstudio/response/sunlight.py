@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -205,7 +205,7 @@ def _yard(points: Tensor, normals: Tensor, luminance: Tensor, surface: SurfaceMe
     starts = _starts(place, facing, surface)
     sky, slope = _sky(starts, facing, surface, SKY_RAYS, generator)
     features = torch.cat([place, TURN * facing], dim=1).numpy()
-    around = torch.from_numpy(cKDTree(features).query(features, NEIGHBOURS + 1)[1])
+    around = torch.from_numpy(KDTree(features).query(features, NEIGHBOURS + 1)[1])
     which = torch.rand(len(place), NEIGHBOURS, generator=generator).argsort(dim=1)[:, :PARTNERS] + 1
     first, second = torch.arange(len(place)).repeat_interleave(PARTNERS), around.gather(1, which).flatten()
     alike = (facing[first] * facing[second]).sum(1) > ALIKE
@@ -252,6 +252,11 @@ def _loss(errors: Tensor, width: float) -> Tensor:
     return squares / (squares + width**2)
 
 
+def _bounded(z: np.ndarray) -> np.ndarray:
+    """The same of squares in units of the width, with its first two derivatives."""
+    return np.stack([z / (1 + z), (1 + z) ** -2.0, -2 * (1 + z) ** -3.0])
+
+
 def _fitted(yard: _Yard, cosines: Float[Tensor, "n"], *, width: float, strongest: float) -> _Fit:
     """Ratio, bounce and gradient of the sky with the least loss, for one sun; `strongest` = 0: for none."""
     closed = 1 - yard.sky
@@ -272,9 +277,9 @@ def _fitted(yard: _Yard, cosines: Float[Tensor, "n"], *, width: float, strongest
     found = least_squares(
         residuals,
         [upper[0] / 30, 0.25, 0.0, 0.0, 0.0],
-        jacobian,
+        jacobian,  # pyright: ignore[reportArgumentType]
         bounds=([0.0, 0.0, -0.7, -0.7, -0.7], upper),
-        loss=lambda z: np.stack([z / (1 + z), (1 + z) ** -2, -2 * (1 + z) ** -3]),
+        loss=_bounded,  # pyright: ignore[reportArgumentType]
         max_nfev=30,
     ).x
     # Such a sky gives open level ground 1 + 2/3 of its vertical gradient.
