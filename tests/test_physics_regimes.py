@@ -11,6 +11,7 @@ import torch
 
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate
 from pgsd_nerfstudio.physics.air import Air
+from pgsd_nerfstudio.physics.arrival import Arrival
 from pgsd_nerfstudio.physics.chunks import DENSE, SLID, SPLASHED
 from pgsd_nerfstudio.physics.contact import Ground
 from pgsd_nerfstudio.physics.emitters import Sizes
@@ -111,7 +112,8 @@ def test_what_vanishes_leaves_nothing():
 def air_of(effect: Effect) -> Air:
     sizes = Sizes.of(effect, DOMAIN.volume, 100)
     ground = Ground.of(floor(), effect.surface, DOMAIN)
-    return Air(DOMAIN, sizes, WindField.draw(effect.wind, 0), effect, ground, Sight.everything(), 0.04, 0)
+    wind, arrival = WindField.draw(effect.wind, 0), Arrival.of(effect.spell, DOMAIN, effect.wind)
+    return Air(DOMAIN, sizes, wind, arrival, effect, ground, Sight.everything(), 0.04, 0)
 
 
 def test_splashes_grow_with_the_energy_and_carry_a_share_of_it():

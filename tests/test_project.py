@@ -54,7 +54,8 @@ def test_every_pgsd_flag_of_the_readme_is_known(capsys):
 
 
 def test_every_training_flag_of_the_readme_is_a_field_of_the_options():
-    text = (ROOT / "pgsd_nerfstudio" / "plugin" / "options.py").read_text("utf-8")
+    declared = ("plugin/options.py", "weather/knobs.py")
+    text = "".join((ROOT / "pgsd_nerfstudio" / path).read_text("utf-8") for path in declared)
     fields = {f"--{name.replace('_', '-')}" for name in re.findall(r"^    (\w+): ", text, re.MULTILINE)}
     used = {word for words in commands() if words[0] == "ns-train" for word in words if word.startswith("--")}
     assert used and used <= fields

@@ -37,7 +37,7 @@ def flat_at(points: torch.Tensor) -> Gaussians:
 def test_open_ground_catches_all_and_sees_all_of_the_sky():
     found = Exposure.of(flat_at(torch.tensor([[0.3, 0.2, 0.0], [3.0, -1.0, 0.01]])), mesh(GROUND), effect("snowfall"))
     assert found.catches == pytest.approx([1.0, 1.0], abs=1e-5)
-    assert found.sky == pytest.approx([1.0, 1.0], abs=0.09)  # rays at less than a degree are not counted
+    assert found.sky == pytest.approx([1.0, 1.0], abs=0.09)
     assert not found.loose.any() and found.level.min() > 0.99
 
 
@@ -72,6 +72,14 @@ def test_a_wall_catches_what_the_wind_drives_against_it_and_its_lee_nothing():
     assert found.normals[:, 0] == pytest.approx([-1.0, 1.0], abs=1e-5)
     assert found.catches[0] == pytest.approx(4.0 * slowness, rel=0.05)
     assert found.catches[1] == 0
+
+
+def test_the_underside_of_a_thin_sheet_catches_nothing():
+    """Open below, so that no shelter could do it: what comes from above hits the other side."""
+    sheet = quad([(-1.0, -1, 2.0), (-1, 1, 2), (1, 1, 2), (1, -1, 2)])  # its open side looks down
+    found = Exposure.of(flat_at(torch.tensor([[0.0, 0, 2.0]])), mesh(sheet), effect("snowfall"))
+    assert found.normals[0, 2] == pytest.approx(-1.0, abs=1e-5)
+    assert found.catches[0] == 0
 
 
 def test_mass_comes_down_at_the_speeds_of_the_sizes_that_carry_it():

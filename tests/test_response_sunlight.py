@@ -11,7 +11,7 @@ import pytest
 import roma
 import torch
 
-import pgsd_nerfstudio.response.sunlight as module
+from pgsd_nerfstudio.response.sun_search import FEWEST
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor, sky_seen
 from pgsd_nerfstudio.scene.courtyard.baking import SUN, SUN_LIGHT, sky_light
 from pgsd_nerfstudio.scene.loading import load_scene
@@ -207,7 +207,7 @@ def test_where_no_light_of_the_sky_comes_clouds_change_nothing():
 
 
 def test_too_few_points_or_nothing_that_casts_shadows_is_no_sun():
-    yard = box_on_plane(5.0, toward(30, 140), count=module.FEWEST // 2)
+    yard = box_on_plane(5.0, toward(30, 140), count=FEWEST // 2)
     assert find_sunlight(*yard) is None
     yard = box_on_plane(5.0, toward(30, 140), count=2000)
     assert find_sunlight(*yard._replace(surface=SurfaceMesh.empty())) is None

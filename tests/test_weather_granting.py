@@ -79,18 +79,21 @@ def _ratio(new: Any, old: Any) -> Any:
     return round(new / old, 9) if isinstance(new, int | float) and old and not isinstance(new, bool) else new
 
 
-def mixed(base: Effect) -> tuple[float, ...]:
-    """Ratios of the haze's colour, 35 % of the way to purple, to its own."""
-    own = base.haze.rgb if base.haze else PURPLE
-    return tuple(round((0.65 * old + 0.35 * new) / old, 9) for old, new in zip(own, PURPLE, strict=True))
+def purple(base: Effect) -> dict[str, Any]:
+    """What a purple wish changes: air and sky go 35 % of the way between flakes and drops, 90 % where they are the matter."""
+    share = 0.35 if base.emission.precipitates else 0.9
+    owns = {"haze.rgb": base.haze.rgb, "ambience.sky": base.ambience.sky} if base.haze and base.ambience else {}
+    air = {
+        name: tuple(round(((1 - share) * old + share * new) / old, 9) for old, new in zip(own, PURPLE, strict=True))
+        for name, own in owns.items()
+    }
+    assert air
+    return {"appearance.active.rgb": PURPLE, "appearance.collided.rgb": PURPLE, **air}
 
 
 TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
     *((base, {}, {}) for base in EFFECTS.values()),
-    *(
-        (base, {"rgb": PURPLE}, {"appearance.active.rgb": PURPLE, "appearance.collided.rgb": PURPLE, "haze.rgb": mixed(base)})
-        for base in EFFECTS.values()
-    ),
+    *((base, {"rgb": PURPLE}, purple(base)) for base in EFFECTS.values()),
     *((base, {"landed_rgb": PURPLE}, {"appearance.collided.rgb": PURPLE}) for base in EFFECTS.values()),
     (
         SNOWFALL,

@@ -57,6 +57,9 @@ class Preview(Knobs, Simulated):
     """Width in pixels."""
     height: int = 360
     """Height in pixels."""
+    edited_images: Path | None = None
+    """Folder of training views as an image editor shows them under this weather, named as the originals are.
+    The scene's look is fitted to them (1000 iterations, kept in the cache) and comes with the weather."""
     start: float | None = None
     """First second to show; by default the last ones are shown, when the most has gathered."""
     views: tuple[int, int] | None = None
@@ -76,7 +79,7 @@ class Preview(Knobs, Simulated):
             cameras = self._cameras(scene)
         self._make_folder()
         say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
-        with refusing(OSError):  # a full disk while caching
+        with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
             picture = self._pictures(scene, effect, cameras)
         poster = self.output.with_suffix(".png")
         shown = track(range(self.frames), "rendering", console=console(), transient=True)
@@ -134,6 +137,7 @@ class Preview(Knobs, Simulated):
         from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
         from pgsd_nerfstudio.physics import MAX_PARTICLES, Clock, motion_prior
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+        from pgsd_nerfstudio.response.prepare import answer_of, edits_of
         from pgsd_nerfstudio.surface.mesh import surface_of
         from pgsd_nerfstudio.weather import initial_look
 
@@ -145,14 +149,17 @@ class Preview(Knobs, Simulated):
         most = self.max_particles or (200_000 if device == "cuda" else MAX_PARTICLES)
         how = {"profile": self.physics, "everything": self.everything}
         history = motion_prior(scene, surface, effect, clock, seed=self.seed, max_particles=most, **how).to(device)
+        edits = None if self.edited_images is None else edits_of(scene, self.edited_images, device, seed=self.seed)
+        answer = answer_of(scene, surface, effect, seconds=self.seconds, seed=self.seed, edits=edits).to(device)
         # A field that has learned nothing hands on the simulated motion and the initial look, bit for bit.
         look, field = initial_look(effect, history, seed=self.seed), DynamicsField.for_history(history)
         rollout = Rollout(history, look, field, exposure=effect.appearance.exposure)
         cameras = cameras.to(device)
 
         def picture(index: int) -> Tensor:
-            weather = scene.frame.gaussians_to_scene(rollout.gaussians(self._first + index))
-            return rasterizer.render(cameras[index], weather).rgb[0]
+            frame = self._first + index
+            weather = scene.frame.gaussians_to_scene(rollout.gaussians(frame))
+            return rasterizer.render(cameras[index], weather, None, answer.at(frame / self.fps)).rgb[0]
 
         return picture
 

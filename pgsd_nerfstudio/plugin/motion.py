@@ -19,7 +19,7 @@ from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.response.answer import Answer
-from pgsd_nerfstudio.response.prepare import answer_of, save_answer, stored_answer
+from pgsd_nerfstudio.response.prepare import answer_of, edits_of, save_answer, stored_answer
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import content_key
@@ -61,7 +61,10 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
         )
         made_for = {"splat": _splat_key(stage.scene), "frame": _written(stage.scene.frame)}
         history = replace(history, about={**history.about, **made_for})
-        answer = answer_of(stage.scene, surface, effect, seconds=options.seconds, seed=options.weather_seed)
+        edits = None
+        if options.edited_images is not None:
+            edits = edits_of(stage.scene, options.edited_images, stage.device, seed=options.weather_seed)
+        answer = answer_of(stage.scene, surface, effect, seconds=options.seconds, seed=options.weather_seed, edits=edits)
         if run_folder is not None:
             history.save(run_folder / FILE)
             save_answer(run_folder / ANSWER_FILE, answer)

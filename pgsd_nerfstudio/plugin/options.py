@@ -58,6 +58,12 @@ class WeatherOptions(Knobs, SceneOptions):
     """Simulate also the air that no training camera can see; costs time, and free camera paths see weather everywhere."""
     weather_seed: int = 0
     """Another seed, another snowfall of the same kind. (--machine.seed varies the training only.)"""
+    edited_images: Path | None = None
+    """Folder of training views as an image editor shows them under this weather, named as the originals are: the scene's look
+    is fitted to them (1000 iterations, as in the paper) and comes with the weather. By default it follows from geometry."""
+    surfaces_in_clips: bool | None = None
+    """Whether training clips show the scene's answer (cover, wetness, light, haze), as what is looked at does. By default they
+    do, except with the bundled prior, which has only ever seen flakes in a scene that stays as it is."""
     prior: str = "bundled"
     """The video prior: bundled (small, knows only clips like the demo's), a diffusers CogVideoX folder, or a hub id such as
     THUDM/CogVideoX-2b."""
@@ -107,6 +113,11 @@ class WeatherOptions(Knobs, SceneOptions):
         return WeatherOptions(load_scene=Path())
 
     @property
+    def answering_clips(self) -> bool:
+        """Whether training clips show the scene's answer."""
+        return self.prior != "bundled" if self.surfaces_in_clips is None else self.surfaces_in_clips
+
+    @property
     def frames(self) -> int:
         """Frames of the whole weather."""
         return max(2, round(self.seconds * self.fps))
@@ -123,6 +134,8 @@ class WeatherOptions(Knobs, SceneOptions):
             )
         if self.data is not None and not self.data.exists():
             raise RunError(f"no data at {self.data}: expected nerfstudio's transforms.json or its folder")
+        if self.edited_images is not None and not self.edited_images.is_dir():
+            raise RunError(f"--edited-images must be a folder of edited training views, found none at {self.edited_images}")
         positive = {
             "seconds": self.seconds,
             "fps": self.fps,

@@ -136,7 +136,8 @@ class WeatherPipeline(VanillaPipeline):
             rolled = model.rollout.window(start, len(views), visible=seen)
             weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
-            moments = [model.moment(start + k) for k in range(len(views))]
+            answering = options.answering_clips
+            moments = [model.moment(start + k) if answering else None for k in range(len(views))]
             clip = render_clip(stage, views, weather, background, moments)
         if stage.clip_rasterizer is not stage.rasterizer and not self._layers_judged:
             exact = replace(stage, clip_rasterizer=stage.rasterizer)

@@ -20,7 +20,8 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
         "scene": f"{options.load_scene} ({len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views), {scene.description}",
         "scale and ground": scene.frame.source,
         "device": str(stage.device),
-        "weather": f"{options.effect}, {emission.intensity:g} {emission.unit}, {options.seconds:g} s at {options.fps:g} fps",
+        "weather": f"{options.weather or options.effect}, {emission.intensity:g} {emission.unit}, "
+        f"{options.seconds:g} s at {options.fps:g} fps",
         "particles": f"{len(history):,} ({int(history.collided.sum()):,} of them land)",
         "video prior": f"{guide.prior.name}",
         "wanted": guide.wanted,

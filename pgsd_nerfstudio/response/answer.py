@@ -130,9 +130,9 @@ class Shown:
         return self.answer.effect.spell.share(self.seconds)
 
     def altered(self, frozen: Gaussians) -> Gaussians:
-        """Under a layer Gaussians are wider and more opaque; edited pictures move them first."""
+        """Under a layer Gaussians are wider and more opaque; edited pictures say themselves what they are."""
         if self.answer.edits is not None:
-            frozen = self.answer.edits.applied(frozen, self.answer.share_of_edits(self.seconds))
+            return self.answer.edits.applied(frozen, self.answer.share_of_edits(self.seconds))
         if not bool((self.hidden > 0).any()):
             return frozen
         opacities = 1 - (1 - frozen.opacities) ** (1 + OPAQUE_UNDER * self.hidden)
@@ -159,18 +159,19 @@ class Shown:
         Args:
             towards: metric unit vectors to the camera; None: no mirror.
         """
-        answer, ambience = self.answer, self.answer.effect.ambience
+        effect, edited = self.answer.effect, self.answer.edits is not None
         light = linear(rgb)
-        if ambience is not None:
-            light = self._in_weather(light, ids, ambience)
-        wet = self.wet[ids, None].to(light)
-        if answer.effect.surface.landing == "wets":
-            wet = wet * (1 - WAXEN * leafy(light)[:, None])
-            light = torch.lerp(light, wetted(light), wet)
+        # Edited pictures show light, water and layer in their own way; only what depends on the camera is added.
+        if effect.ambience is not None and not edited:
+            light = self._in_weather(light, ids, effect.ambience)
+        if effect.surface.landing == "wets":
+            wet = self.wet[ids, None].to(light) * (1 - WAXEN * leafy(light)[:, None])
+            light = light if edited else torch.lerp(light, wetted(light), wet)
             if towards is not None:
-                light = light + wet * self._mirror(ids, towards, ambience or Ambience())
-        hidden = self.hidden[ids, None].to(light)
-        return encoded(torch.lerp(light, self._layer(light, ids), hidden))
+                light = light + wet * self._mirror(ids, towards, effect.ambience or Ambience())
+        if edited:
+            return encoded(light)
+        return encoded(torch.lerp(light, self._layer(light, ids), self.hidden[ids, None].to(light)))
 
     def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
         """Light of the layer on Gaussians."""

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.populations import fall_speed, number_density
+from pgsd_nerfstudio.response.rays import blocked, open_sky
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.effect import Effect
 
 RAYS = 24  # per Gaussian and kind; their noise, a tenth, is less than what neighbours differ by
@@ -56,13 +57,10 @@ class Exposure:
         catches = torch.zeros(len(metric))
         for way, flux in zip(ways, fluxes, strict=True):
             facing = torch.where(loose, LOOSE_CATCH * way.norm(), -(normals @ way).clamp_max(0.0))
-            open_to = ~_blocked(surface, starts, -way / way.norm(), facing > 0)
-            catches += flux * facing * open_to
-        sky = torch.zeros(len(metric))
-        for ray in range(RAYS):
-            towards = torch.nn.functional.normalize(normals + _sphere(ray, generator), dim=1)  # cosine-weighted
-            above = towards[:, 2] > 0.02
-            sky += (above & ~_blocked(surface, starts, towards, above)).float() / RAYS
+            asked = (facing > 0).nonzero()[:, 0]
+            facing[asked[blocked(surface, starts[asked], (-way / way.norm()).expand(len(asked), 3))]] = 0.0
+            catches += flux * facing
+        sky, _ = open_sky(starts, normals, surface, RAYS, generator)
         return Exposure(normals, loose, catches, level, sky)
 
 
@@ -112,24 +110,3 @@ def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor,
     """Whether the first thing above a point is the back of a surface: then it fills what a camera sees as that surface."""
     hits = surface.cast(points, torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3))
     return torch.isfinite(hits.distance) & (hits.distance < SUNK) & (hits.normal[:, 2] > 0)
-
-
-def _sphere(ray: int, generator: torch.Generator) -> Float[Tensor, "3"]:
-    """A point on the unit sphere; one after the other they are spread evenly (Fibonacci), turned at random."""
-    turn = float(torch.rand((), generator=generator)) / RAYS
-    z = 1 - 2 * (ray + 0.5) / RAYS
-    angle = 2 * math.pi * (ray * 0.6180339887 + turn)
-    ring = math.sqrt(1 - z * z)
-    return torch.tensor([ring * math.cos(angle), ring * math.sin(angle), z])
-
-
-def _blocked(
-    surface: SurfaceMesh, starts: Float[Tensor, "n 3"], towards: Tensor, asked: Bool[Tensor, "n"]
-) -> Bool[Tensor, "n"]:
-    """Whether the surface lies on the way from each start in a direction, [3] or [n, 3]; only where asked."""
-    blocked = torch.zeros(len(starts), dtype=torch.bool)
-    if len(surface.triangles) == 0 or not bool(asked.any()):
-        return blocked
-    rays = queries(starts[asked], towards.expand(len(starts), 3)[asked])
-    blocked[asked] = torch.from_numpy(surface.raycasting.test_occlusions(rays).numpy())
-    return blocked

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer
-from pgsd_nerfstudio.response.edited import Edits
+from pgsd_nerfstudio.response.edited import Edits, edits_key, fit_edits, read_edited
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers
@@ -42,16 +42,18 @@ def answer_of(
     Raises:
         OSError: the cache could not be written.
     """
-    key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, effect, seed)
+    # Only what rays find out is kept, so only what they depend on names the file.
+    parts = (effect.emission, effect.material, effect.wind, effect.ambience)
+    key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, *parts, seed)
     path = cache_dir() / "answers" / f"{key}.safetensors"
-    answer = stored_answer(path, scene, effect, seconds=seconds, seed=seed, edits=edits)
+    answer = stored_answer(path, scene, effect, seconds=seconds, seed=seed)
     if answer is None:
         metric = to_metric(scene)
         exposure = Exposure.of(metric, surface, effect, seed=seed)
         softening = softening_of(metric, exposure, surface, effect)
-        answer = _answer(scene, effect, exposure, softening, seconds, seed, edits)
+        answer = _answer(scene, effect, exposure, softening, seconds, seed, None)
         save_answer(path, answer)
-    return answer
+    return replace(answer, edits=edits)
 
 
 def save_answer(path: Path, answer: Answer) -> None:
@@ -63,21 +65,22 @@ def save_answer(path: Path, answer: Answer) -> None:
     tensors = {f.name: getattr(answer.exposure, f.name) for f in fields(Exposure)}
     if answer.softening is not None:
         tensors["softening"] = answer.softening
+    if answer.edits is not None:
+        tensors |= {f"edited.{name}": tensor for name, tensor in answer.edits.tensors.items()}
     save_tensors(path, tensors, {"revision": _REVISION})
 
 
-def stored_answer(
-    path: Path, scene: Scene, effect: Effect, *, seconds: float, seed: int = 0, edits: Edits | None = None
-) -> Answer | None:
+def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, seed: int = 0) -> Answer | None:
     """The answer of a file; None where there is none, or where it is damaged or of another scene or version."""
     stored = load_tensors(path)
     if stored is None or stored[1].get("revision") != _REVISION:
         return None
     tensors = stored[0]
     softening = tensors.pop("softening", None)
+    edited = {name.removeprefix("edited."): tensors.pop(name) for name in list(tensors) if name.startswith("edited.")}
     if set(tensors) != {f.name for f in fields(Exposure)} or len(tensors["sky"]) != len(scene.gaussians):
         return None
-    return _answer(scene, effect, Exposure(**tensors), softening, seconds, seed, edits)
+    return _answer(scene, effect, Exposure(**tensors), softening, seconds, seed, Edits(**edited) if edited else None)
 
 
 def _answer(
@@ -102,6 +105,24 @@ def _answer(
     )
 
 
+def edits_of(scene: Scene, folder: Path, device: torch.device | str, *, seed: int = 0) -> Edits:
+    """The change of the scene that edited pictures of its views ask for; fitted once, interruptible, kept in the cache.
+
+    Raises:
+        ValueError: the folder holds no picture of a view, or one that cannot be read.
+        FloatingPointError: the fit found no finite gradient, several steps in a row.
+        OSError: the cache could not be written.
+    """
+    pictures = read_edited(folder, scene)
+    key = edits_key(scene, pictures, seed=seed, device=device)
+    path = cache_dir() / "edits" / f"{key}.safetensors"
+    edits = Edits.load(path, key)
+    if edits is None:
+        edits = fit_edits(scene, pictures, seed=seed, device=device, resume=path.with_suffix(".unfinished.safetensors"))
+        edits.save(path, key)
+    return edits
+
+
 def to_metric(scene: Scene) -> Gaussians:
     """The frozen Gaussians in metres; plain colours."""
     frozen = scene.gaussians
@@ -121,5 +142,5 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     seen = lit(sun, metric.means, exposure.normals, surface)
     factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
     # Shadows of a mesh lie some centimetres beside those of the picture: what neighbours share leaves no bright rims.
-    _, around = cKDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
+    _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
     return factor.log()[torch.from_numpy(around).reshape(len(factor), -1)].mean(1).exp()

@@ -1,6 +1,7 @@
 """What falls: one Effect per weather, pure configuration, and the look it starts from."""
 
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook, initial_look
+from typing import TYPE_CHECKING, Any
+
 from pgsd_nerfstudio.weather.effect import EFFECTS, Appearance, Effect, StateLook, Wind, effect
 from pgsd_nerfstudio.weather.fog import FOG
 from pgsd_nerfstudio.weather.matter import Dense, Emission, Material
@@ -8,6 +9,9 @@ from pgsd_nerfstudio.weather.rainfall import RAINFALL
 from pgsd_nerfstudio.weather.sandstorm import SANDSTORM
 from pgsd_nerfstudio.weather.snowfall import SNOWFALL
 from pgsd_nerfstudio.weather.touch import Splash, SurfaceResponse
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook, initial_look
 
 __all__ = [
     "EFFECTS",
@@ -29,3 +33,12 @@ __all__ = [
     "effect",
     "initial_look",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The look needs torch and is imported when it is asked for: `pgsd --help` knows the knobs of a weather without it."""
+    if name not in ("InitialLook", "ParticleLook", "initial_look"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from pgsd_nerfstudio.weather import appearance
+
+    return getattr(appearance, name)

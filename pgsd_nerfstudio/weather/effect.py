@@ -61,8 +61,8 @@ class StateLook:
     """None: from the extinction of the droplets that a particle stands for, so that many of them obey Beer-Lambert."""
     opacity_spread: float = 0.10
     fades_below: float = 0.0
-    """Diameter in metres below which opacity falls with the particle's area: a rasterizer draws nothing thinner than a pixel, so
-    that spray would shine like drops. 0: never."""
+    """Diameter in metres below which opacity falls with the particle's area; 0: never. A rasterizer draws nothing thinner than
+    a pixel, so that spray would shine like drops."""
     rgb: tuple[float, float, float] = (0.95, 0.97, 1.0)
     tone_spread: float = 0.04
     """Variation of brightness from particle to particle; brightness stays within 0.80-1."""

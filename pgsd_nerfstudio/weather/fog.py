@@ -15,7 +15,9 @@ from pgsd_nerfstudio.weather.touch import SurfaceResponse
 FOG = register(
     Effect(
         name="fog",
-        emission=Emission(kind="fog droplets", intensity=25.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35),
+        emission=Emission(
+            kind="fog droplets", intensity=25.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35
+        ),
         material=Material(mass_milligram=0.5236, mass_exponent=3.0, speed_law="fog"),
         wind=Wind(speed=0.5, gustiness=0.25, turbulence=0.12, flutter=0.0, diffusivity=0.01),
         surface=SurfaceResponse(landing="glides", accumulates=False),

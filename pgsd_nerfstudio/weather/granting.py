@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from pgsd_nerfstudio.weather.ambience import Ambience
 from pgsd_nerfstudio.weather.effect import EFFECTS, Appearance, Effect, StateLook, Wind
 from pgsd_nerfstudio.weather.haze import Haze
 from pgsd_nerfstudio.weather.matter import INTENSITIES, Emission, Material
@@ -23,14 +24,16 @@ GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
 """Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
 is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the
 snowflakes are opaque and the rest fade."""
-HAZE_SHARE = 0.35
-"""Part of the way from the base's haze to the colour of what flies: what hangs in the air is mostly the same air."""
+HAZE_SHARE, MATTER_SHARE = 0.35, 0.9
+"""Part of the way from the base's haze to the colour of what flies. Between flakes and drops it is mostly the same air; fog and
+dust are the haze themselves."""
 
 
 def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
     """The effect that a wish asks for; what it says nothing about stays as the base has it.
 
-    - `rgb`: colour of what flies, and of what has landed where `landed_rgb` says no other; the haze takes HAZE_SHARE of it.
+    - `rgb`: colour of what flies, and of what has landed where `landed_rgb` says no other; haze and sky
+      take HAZE_SHARE of it, those of fog and sand MATTER_SHARE.
     - `landed_rgb`: colour of what has landed.
     - `size`: see the module.
     - `amount`: precipitation times it, or visibility divided by it, within INTENSITIES. Fog, whose parcels stand for droplets
@@ -56,7 +59,8 @@ def granted(wish: Wish, *, base: Effect | None = None) -> Effect:
         wind=_wind(wish, base.wind),
         surface=_surface(wish, base.surface),
         appearance=_appearance(wish, base),
-        haze=_haze(wish.rgb, base.haze),
+        haze=_haze(wish, base),
+        ambience=_ambience(wish, base),
         prompt=wish.prompt,
     )
 
@@ -160,11 +164,20 @@ def _appearance(wish: Wish, base: Effect) -> Appearance:
     return replace(looks, active=active, collided=collided)
 
 
-def _haze(rgb: Rgb | None, haze: Haze | None) -> Haze | None:
-    if rgb is None or haze is None:
-        return haze
-    red, green, blue = (own + HAZE_SHARE * (asked - own) for own, asked in zip(haze.rgb, rgb, strict=True))
-    return replace(haze, rgb=(red, green, blue))
+def _haze(wish: Wish, base: Effect) -> Haze | None:
+    return None if base.haze is None else replace(base.haze, rgb=_tinted(base.haze.rgb, wish, base))
+
+
+def _ambience(wish: Wish, base: Effect) -> Ambience | None:
+    return None if base.ambience is None else replace(base.ambience, sky=_tinted(base.ambience.sky, wish, base))
+
+
+def _tinted(own: Rgb, wish: Wish, base: Effect) -> Rgb:
+    if wish.rgb is None:
+        return own
+    share = HAZE_SHARE if base.emission.precipitates else MATTER_SHARE
+    red, green, blue = (a + share * (b - a) for a, b in zip(own, wish.rgb, strict=True))
+    return red, green, blue
 
 
 def _look(wish: Wish, state: StateLook) -> StateLook:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from numpy import ndarray
-from torch import Tensor
 
-Array = TypeVar("Array", ndarray, Tensor)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Array = TypeVar("Array", ndarray, "Tensor")
 
 Kind = Literal["snowflakes", "raindrops", "fog droplets", "sand grains"]
 
