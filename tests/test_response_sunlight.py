@@ -230,3 +230,8 @@ def test_what_does_not_fit_together_is_refused(change, says):
 def test_clouds_are_a_share():
     with pytest.raises(ValueError, match=r"got 1\.5"):
         overcast_factor(NOON, torch.ones(1), torch.ones(1), 1.5)
+
+
+def test_a_scene_of_one_colour_has_no_sun():
+    yard = box_on_plane(5.0, toward(30, 140))
+    assert find_sunlight(yard.points, yard.normals, torch.full_like(yard.luminance, 0.3), yard.surface) is None

@@ -46,7 +46,7 @@ class Yard:
 
     @property
     def spread(self) -> float:
-        return 1.4826 * float(self.differences.abs().median())
+        return scatter(self.differences)
 
     def contrast(self, light: Float[Tensor, "n *k"]) -> Float[Tensor, "p *k"]:
         """How log light differs between neighbours."""
@@ -123,6 +123,11 @@ def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, "n"]:
     for label, part in enumerate(parts):
         labels[part] = label
     return torch.from_numpy(labels)
+
+
+def scatter(errors: Float[Tensor, "p"]) -> float:
+    """Standard deviation by the median of magnitudes; never zero, as where a scene is of one colour."""
+    return max(1.4826 * float(errors.abs().median()), 1e-4)
 
 
 def bounded_loss(errors: Tensor, width: float) -> Tensor:

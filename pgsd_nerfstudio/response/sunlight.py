@@ -31,6 +31,7 @@ from pgsd_nerfstudio.response.sun_search import (
     fitted,
     foretold_losses,
     losses_by_cell,
+    scatter,
     search,
     standard_errors,
     yard_of,
@@ -81,7 +82,7 @@ def find_sunlight(
     if yard is None:
         return None
     sky = fitted(yard, torch.zeros_like(yard.sky), width=yard.spread, strongest=0.0)
-    width = 1.4826 * float((yard.differences - yard.contrast(sky.light)).abs().median())
+    width = scatter(yard.differences - yard.contrast(sky.light))
     sky = fitted(yard, torch.zeros_like(yard.sky), width=width, strongest=0.0)
     directions, cosines, best = search(yard, surface, width)
     fits = [fitted(yard, cosines[:, k], width=width, strongest=STRONGEST) for k in best]
