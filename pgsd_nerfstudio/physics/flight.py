@@ -156,7 +156,14 @@ class _Walk:
 
     def _lie(self, bodies: Bodies, frame: int, *, heaped: bool = False) -> None:
         """Particles whose way ends here, on the cover that they make thicker."""
-        self.log.land(bodies, self.deposits.lay(bodies, heaped=heaped), frame)
+        cover = self.deposits.cover
+        before = np.zeros(len(bodies)) if cover is None else cover.height(bodies.positions.astype(np.float64))
+        covers = self.deposits.lay(bodies, heaped=heaped)
+        if not heaped:
+            # They touched the cover as it was, and lie on it as it has become: the surface beneath is where it was.
+            bodies = replace(bodies, positions=bodies.positions.copy())
+            bodies.positions[:, 2] += (covers - before).astype(np.float32)
+        self.log.land(bodies, covers, frame)
 
 
 def _check(bodies: Bodies, frame: int) -> None:

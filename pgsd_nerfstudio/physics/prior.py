@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 Profile = Literal["metric", "paper"]
-_REVISION = 3  # of what is computed; a stored history of another revision is not used
+_REVISION = 4  # of what is computed; a stored history of another revision is not used
 
 
 def motion_prior(
@@ -89,7 +89,7 @@ def summary(history: ParticleHistory) -> str:
     change = np.bincount(births, minlength=history.frames + 1) - np.bincount(ends, minlength=history.frames + 1)
     active = np.cumsum(change)[: history.frames]
     about = history.about
-    landed = int(history.collided.sum())
+    landed, stands_for = int(history.collided.sum()), float(history.represents.mean()) if len(history) else 0.0
     ways = {
         "slid": "slid",
         "dense": "were dense matter",
@@ -100,7 +100,7 @@ def summary(history: ParticleHistory) -> str:
     return (
         f"{about.get('effect', 'motion prior')}: {len(history):,} particles over {history.frames} frames, "
         f"{active.mean():,.0f} on their way on average (at most {active.max():,}), {landed:,} landed{regimes}; "
-        f"each stands for {float(history.represents.mean()):.3g} real ones, {about.get('air_simulated', 1.0):.0%} of the air "
+        f"each stands for {stands_for:.3g} real ones, {about.get('air_simulated', 1.0):.0%} of the air "
         f"simulated, {about.get('seconds', 0.0):.1f} s"
     )
 

@@ -22,6 +22,7 @@ PARTS = 2  # of a frame: the surface is followed in straight pieces of a centime
 DETACH = 0.02  # m above the surface at which a slider has lost it
 BEYOND = 0.005  # m beyond an edge, sideways from the nearest point, at which it has lost it too
 SLOW = 0.05  # m/s
+SHORT = 0.01  # share of a way by which it ends before the surface that it meets
 LIFT = 0.002  # m above the surface on which sliders move, so that rays of the next frame begin outside
 
 
@@ -41,7 +42,7 @@ def slide(bodies: Bodies, surface: SurfaceMesh, friction: float, step: float) ->
     _, normal = _nearest(surface, x)
     for _ in range(PARTS):
         v = accelerated(v, normal, bodies.speeds, friction, dt)
-        moved = x + v * dt
+        moved = _stopped(surface, x, x + v * dt)
         new_at, new_normal = _nearest(surface, moved)
         gap = moved - new_at
         distance, upright = np.linalg.norm(gap, axis=1), np.abs((gap * new_normal).sum(1))
@@ -53,6 +54,14 @@ def slide(bodies: Bodies, surface: SurfaceMesh, friction: float, step: float) ->
     slow = np.linalg.norm(x - begin, axis=1) < SLOW * step
     moved = replace(bodies, positions=x.astype(np.float32), velocities=v.astype(np.float32))
     return Slid(moved, slow & ~flies, flies)
+
+
+def _stopped(surface: SurfaceMesh, x: Float[ndarray, "n 3"], moved: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+    """Where the ways from `x` end: before the first surface that they would cross. Nothing changes sides in a corner."""
+    way = moved - x
+    hits = surface.cast(torch.from_numpy(x.astype(np.float32)), torch.from_numpy(way.astype(np.float32)))
+    share = (hits.distance.numpy().astype(np.float64) - SHORT).clip(0.0, 1.0)
+    return x + np.where(np.isfinite(share), share, 1.0)[:, None] * way
 
 
 def accelerated(
