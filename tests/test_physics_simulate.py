@@ -110,6 +110,20 @@ def test_the_cover_holds_the_snow_that_landed_and_raises_what_lands_later(histor
     assert (flat.rest_covers == 0).all()
 
 
+def test_flakes_on_a_growing_cover_lie_above_what_is_thin():
+    """A board of 2 cm that looks up and down: what falls on its snow must not be taken for lying on its underside."""
+    top = torch.tensor([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    board = torch.cat([top, top - torch.tensor([0.0, 0.0, 0.02])])
+    surface = SurfaceMesh(board, torch.tensor([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], dtype=torch.int32))
+    snow = replace(SNOWFALL, emission=replace(SNOWFALL.emission, intensity=20.0), dense=None)
+    found = simulate(surface, snow, Clock(frames=100), Domain((-1.0, -1, 0), (1.0, 1, 3)), max_particles=2000, progress=False)
+    inside = found.rest_positions[found.collided & (found.rest_positions[:, :2].abs().amax(1) < 0.8)]
+    covers = found.rest_covers[found.collided & (found.rest_positions[:, :2].abs().amax(1) < 0.8)]
+    assert len(inside) > 100 and covers.max() > 0.03
+    assert inside[:, 2].min() > 1.0
+    assert (inside[:, 2] - covers - 1.0).abs().max() < 0.02
+
+
 def test_paths_do_not_jump(history):
     window = history.window(0, CLOCK.frames)
     step = (window.positions[:, 1:] - window.positions[:, :-1]).norm(dim=2)[window.active[:, 1:] & window.active[:, :-1]]

@@ -90,3 +90,19 @@ def test_along_a_wall_it_falls_freely_up_to_its_terminal_speed():
     for _ in range(5):
         bodies = slide(bodies, wall, 0.5, STEP).bodies
     assert bodies.velocities[0, 2] == pytest.approx(-GRAVITY * 5 * STEP, rel=1e-3)
+
+
+@pytest.mark.parametrize("v", [0.5, 2.0, 6.0])
+def test_a_slider_stops_at_a_wall_and_is_never_inside_of_it(v):
+    """A chute that ends at a house: within a step its way would lead deep into the wall."""
+    chute, wall = slope(45.0), 2 * torch.tensor([[0.25, -1.0, -2], [0.25, 1, -2], [0.25, 1, 2], [0.25, -1, 2]])
+    behind = wall + torch.tensor([0.2, 0.0, 0.0])
+    house = SurfaceMesh(
+        torch.cat([chute.vertices, wall, behind]),
+        torch.tensor([[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6], [8, 9, 10], [8, 10, 11]], dtype=torch.int32),
+    )
+    bodies, farthest = body(degrees=45.0, x=0.45, v=v), 0.0
+    for _ in range(20):
+        bodies = slide(bodies, house, 0.2, STEP).bodies
+        farthest = max(farthest, float(bodies.positions[0, 0]))
+    assert 0.4 < farthest < 0.5

@@ -63,4 +63,9 @@ def test_encoding_inverts():
 
 
 def test_leaves_are_told_from_stone():
-    assert leafy(linear(torch.tensor([[0.25, 0.45, 0.15], [0.5, 0.5, 0.48], [0.6, 0.4, 0.3]]))).tolist() == [1.0, 0.0, 0.0]
+    assert leafy(linear(torch.tensor([[0.25, 0.45, 0.15], [0.5, 0.5, 0.48], [0.6, 0.4, 0.3], [0.2, 0.4, 0.7]]))).tolist() == [
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+    ]

@@ -48,7 +48,7 @@ def slide(bodies: Bodies, surface: SurfaceMesh, friction: float, step: float) ->
         distance, upright = np.linalg.norm(gap, axis=1), np.abs((gap * new_normal).sum(1))
         # Within a sheet the gap is upright; past its edge it lies along the sheet. Corners of a rough mesh are in between.
         flies |= (distance > DETACH) | ((distance > BEYOND) & (upright < 0.7 * distance))
-        onto = new_at + LIFT * _outward(new_normal, gap)
+        onto = _stopped(surface, moved, new_at + LIFT * _outward(new_normal, gap))
         x = np.where(flies[:, None], moved, onto)
         normal = new_normal
     slow = np.linalg.norm(x - begin, axis=1) < SLOW * step

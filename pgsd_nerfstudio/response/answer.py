@@ -63,8 +63,6 @@ class Answer:
 
     def at(self, seconds: float) -> Shown | None:
         """What is seen at a second; None where the scene is still as it was, to the bit."""
-        if self.effect.spell.starts_clear and seconds <= 0:
-            return None
         medium = self.haze.at(seconds) if self.haze is not None else None
         hidden, wet = self.layers.hidden(seconds), self.layers.wet(seconds)
         shown = Shown(self, seconds, medium, hidden, wet)
