@@ -9,7 +9,7 @@ from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer, baked
-from pgsd_nerfstudio.response.edited import Edits
+from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers

@@ -13,7 +13,9 @@ from PIL import Image
 from pgsd_nerfstudio.rendering import choose_rasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, view_colors
 from pgsd_nerfstudio.response import edited
-from pgsd_nerfstudio.response.edited import Edits, difference, edits_key, fit_edits, read_edited
+from pgsd_nerfstudio.response.edited import difference, edits_key, fit_edits
+from pgsd_nerfstudio.response.edited_pictures import read_edited
+from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate

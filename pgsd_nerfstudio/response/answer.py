@@ -26,7 +26,7 @@ from pgsd_nerfstudio.weather.effect import Effect
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.rendering.medium import Medium
-    from pgsd_nerfstudio.response.edited import Edits
+    from pgsd_nerfstudio.response.edits import Edits
     from pgsd_nerfstudio.response.haze import HazeField
 
 FAR = 3000.0  # m: where the sky begins, as far as haze is concerned

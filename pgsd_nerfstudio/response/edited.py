@@ -8,29 +8,25 @@ the scene: the scene's own tensors stay as they are, and any share of the change
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, sh_basis, view_colors
+from pgsd_nerfstudio.response.edited_pictures import Picture
+from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
-
-Picture = tuple[int, UInt8[Tensor, "h w 3"]]
-"""Index of the scene's camera, and what the editor made of its view."""
 
 # Of 3DGS but for the colour, which there moves by 0.0007 a step: too slow to whiten anything dark in 1000 steps.
 RATES = {"rgb": 0.02, "logit": 0.03, "log_scale": 0.005}  # of learning, at the first step
@@ -48,152 +44,6 @@ MOMENTS = ("exp_avg", "exp_avg_sq")  # what Adam keeps of each number
 _REVISION = 1  # of what is fitted; what an earlier revision has stored is not used
 
 console = Console(stderr=True, highlight=False)
-
-
-@dataclass(frozen=True)
-class Edits:
-    """A change of n Gaussians; zero leaves them as they are."""
-
-    rgb: Float[Tensor, "n 3"]
-    """Added to plain RGB."""
-    logit: Float[Tensor, "n"]
-    """Added to the logit of the opacity."""
-    log_scale: Float[Tensor, "n 3"]
-    """Added to the logarithms of the scales."""
-
-    def __post_init__(self) -> None:
-        n = self.rgb.shape[0]
-        for name, shape in {"rgb": (n, 3), "logit": (n,), "log_scale": (n, 3)}.items():
-            if (found := tuple(getattr(self, name).shape)) != shape:
-                raise ValueError(f"Edits.{name} must have shape {shape}, found {found}")
-
-    def __len__(self) -> int:
-        return self.rgb.shape[0]
-
-    @property
-    def tensors(self) -> dict[str, Tensor]:
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def to(self, device: torch.device | str) -> Edits:
-        return Edits(**{name: tensor.to(device) for name, tensor in self.tensors.items()})
-
-    def select(self, which: Tensor) -> Edits:
-        """The change of the chosen Gaussians, by mask or by index."""
-        return Edits(**{name: tensor[which] for name, tensor in self.tensors.items()})
-
-    def applied(self, gaussians: Gaussians, share: Float[Tensor, "n"] | float) -> Gaussians:
-        """The Gaussians with a share of the change, one for all or one for each; differentiable.
-
-        Share 0 gives the same values bit for bit, share 1 the look that was fitted. Opacities change by their logits, scales
-        by their logarithms, so that neither leaves its range at any share.
-
-        Raises:
-            ValueError: the change is one of another number of Gaussians, or the shares are.
-        """
-        if len(gaussians) != len(self):
-            raise ValueError(f"this change is one of {len(self):,} Gaussians, found {len(gaussians):,}")
-        if not isinstance(share, Tensor):
-            return gaussians if share == 0 else self._added(gaussians, share)
-        if tuple(share.shape) != (len(self),):
-            raise ValueError(f"expected one share for each of the {len(self):,} Gaussians, found shape {tuple(share.shape)}")
-        share = share.to(gaussians.means)
-        edited, still = self._added(gaussians, share), share == 0
-        kept = {
-            name: torch.where(still.view(-1, *[1] * (tensor.ndim - 1)), tensor, getattr(edited, name))
-            for name, tensor in gaussians.tensors.items()
-            if name in ("colors", "opacities", "scales")
-        }
-        return replace(gaussians, **kept)
-
-    def _added(self, gaussians: Gaussians, share: Tensor | float) -> Gaussians:
-        rows = share[:, None] if isinstance(share, Tensor) else share
-        rgb, logit, log_scale = (tensor.to(gaussians.means) for tensor in self.tensors.values())
-        if gaussians.sh_degree is None:
-            colors = gaussians.colors + rgb * rows
-        else:
-            constant = gaussians.colors[:, :1] + (rgb * rows / SH_C0)[:, None]
-            colors = torch.cat([constant, gaussians.colors[:, 1:]], dim=1)
-        # sigmoid(logit(o) + x) without logarithms: exact where x = 0, and where o is 0 or 1; 80 keeps the odds finite.
-        odds = (logit * share).clamp(-80, 80).exp()
-        opacities = gaussians.opacities * odds / (1 + gaussians.opacities * (odds - 1))
-        return replace(gaussians, colors=colors, opacities=opacities, scales=gaussians.scales * (log_scale * rows).exp())
-
-    def save(self, path: Path, key: str) -> None:
-        """Write one safetensors file, atomically, marked with what it was made from (`edits_key`).
-
-        Raises:
-            OSError: the file could not be written.
-        """
-        save_tensors(path, self.tensors, {"key": key})
-
-    @staticmethod
-    def load(path: Path, key: str) -> Edits | None:
-        """A stored change; None where there is none, it is damaged, or was made from something else."""
-        stored = load_tensors(path)
-        if stored is None or stored[1].get("key") != key or set(stored[0]) != {f.name for f in fields(Edits)}:
-            return None
-        return Edits(**stored[0])
-
-
-def read_edited(folder: Path, scene: Scene) -> list[Picture]:
-    """The edited pictures in a folder, in the order of the views they show and in the size of the cameras.
-
-    A picture carries the name of its photograph, whatever the suffix (frame_00012.png for images/frame_00012.jpg); where the
-    scene has no photographs, the one number in its name is the index of the view. Pictures of any other size are stretched to
-    that of the camera. What belongs to no view is left out, with a note.
-
-    Raises:
-        ValueError: there is no such folder, no picture in it belongs to a view, a picture cannot be read, or two show one view.
-    """
-    folder = Path(folder).expanduser()
-    if not folder.is_dir():
-        raise ValueError(
-            f"edited pictures lie in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
-        )
-    kinds = Image.registered_extensions()
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in kinds and not p.name.startswith(".") and p.is_file())
-    found: dict[int, Path] = {}
-    strangers = []
-    for file in files:
-        index = _view_of(file.stem, scene)
-        if index is None:
-            strangers.append(file.name)
-        elif index in found:
-            raise ValueError(f"{found[index].name} and {file.name} in {folder} both show view {index}; keep one of them")
-        else:
-            found[index] = file
-    if not found:
-        expected = [f"{path.stem}.png" for path in scene.images] or [f"view_{i:04d}.png" for i in range(len(scene.cameras))]
-        there = f"found {len(files)} pictures, such as {files[0].name}" if files else "found no pictures at all"
-        raise ValueError(
-            f"no picture in {folder} belongs to one of the {len(scene.cameras)} views: expected names such as "
-            f"{' and '.join(expected[:2])}, {there}"
-        )
-    if strangers:
-        note = f"{len(strangers)} of the {len(files)} pictures in {folder} belong to no view, such as {strangers[0]}"
-        console.print(f"[yellow]{note}[/]", soft_wrap=True)
-    size = (scene.cameras.width, scene.cameras.height)
-    return [(index, _read_picture(found[index], size)) for index in sorted(found)]
-
-
-def _view_of(stem: str, scene: Scene) -> int | None:
-    """The view that a picture's name stands for, None where it stands for none or for several."""
-    if scene.images:
-        same = [index for index, path in enumerate(scene.images) if path.stem == stem]
-    else:
-        numbers = [int(digits) for digits in re.findall(r"\d+", stem)]
-        same = numbers if len(numbers) == 1 and numbers[0] < len(scene.cameras) else []
-    return same[0] if len(same) == 1 else None
-
-
-def _read_picture(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
-    try:
-        with Image.open(path) as stored:
-            picture = stored.convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"the edited picture {path} cannot be read ({error}): write it again as .png or .jpg") from error
-    resized = picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS)
-    return torch.from_numpy(np.array(resized))
 
 
 def edits_key(

@@ -13,7 +13,9 @@ from torch import Tensor
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer
-from pgsd_nerfstudio.response.edited import Edits, edits_key, fit_edits, read_edited
+from pgsd_nerfstudio.response.edited import edits_key, fit_edits
+from pgsd_nerfstudio.response.edited_pictures import read_edited
+from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers
