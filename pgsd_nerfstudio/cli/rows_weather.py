@@ -20,15 +20,13 @@ from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers
-from pgsd_nerfstudio.response.light import linear, luminance
-from pgsd_nerfstudio.response.prepare import SOLID, to_metric
-from pgsd_nerfstudio.response.sunlight import find_sunlight
+from pgsd_nerfstudio.response.prepare import sun_of, to_metric
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.courtyard.baking import SUN
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
-from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
 from pgsd_nerfstudio.weather.effect import EFFECTS, Effect, effect
 from pgsd_nerfstudio.weather.spell import Spell
 
@@ -46,7 +44,7 @@ def verify(quick: bool) -> list[Record]:
         *_patchy(scene, quick),
         *_layers(scene, surface),
         *_first_second(scene, surface),
-        _sun(scene, surface),
+        _sun(scene),
         *rows_weather_ground.rows(quick),
     ]
 
@@ -81,6 +79,7 @@ def _fog(scene: Scene) -> Iterator[Record]:
 def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, reference: bool) -> float:
     """Brightness of a wall through even fog, white before black airlight or black before white."""
     fog = effect("fog", intensity=visibility)
+    assert fog.haze is not None
     haze = replace(fog.haze, rgb=(0.0,) * 3 if white_wall else (1.0,) * 3, patchiness=0.0)
     even = replace(fog, haze=haze, appearance=replace(fog.appearance, active=replace(fog.appearance.active, opacity=0.5)))
     unit = scene.frame.metres_per_unit
@@ -215,12 +214,11 @@ def _open_answer(scene: Scene, surface: SurfaceMesh, what: Effect) -> Answer:
     )
 
 
-def _sun(scene: Scene, surface: SurfaceMesh) -> Record:
+def _sun(scene: Scene) -> Record:
+    """On the surface that is fused from depth, as captures have it."""
+    surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"), progress=False)
     metric = to_metric(scene)
-    exposure = Exposure.of(metric, surface, effect("snowfall"))
-    asked = ~exposure.loose & (metric.opacities > SOLID)
-    light = luminance(linear(metric.colors))
-    sun = find_sunlight(metric.means[asked], exposure.normals[asked], light[asked], surface)
+    sun = sun_of(metric, Exposure.of(metric, surface, effect("snowfall")), surface)
     name, source = "sun of the demo, found by its shadows", "the direction that the courtyard was baked with"
     if sun is None:
         return Record(name, None, "degrees off", holds=False, source="no sun was found")

@@ -29,6 +29,7 @@ SUNK = 0.5  # m below the ground to which Gaussians still belong to it: light le
 OFF = 0.03  # m off the surface from which rays start: captures are rough by as much
 LOOSE_CATCH = 0.4  # leaves, blades and branches turn half of their area to the sky, on average
 LOOSE_MOST = 0.7  # share of them that a cover can hide
+LEVEL = 0.9  # from which a Gaussian counts as part of a smooth surface
 UNEVEN = 0.3  # how level a Gaussian is that has no plane
 FLAT = 0.5  # thinnest over middle axis, below which a Gaussian has a normal of its own
 
@@ -38,7 +39,8 @@ class Exposure:
     """N Gaussians in a weather."""
 
     normals: Float[Tensor, "n 3"]
-    """Unit, metric; those of the surface, of flat Gaussians away from it, else up."""
+    """Unit, metric: a flat Gaussian's own, turned to the surface's open side; of others in the surface that of the surface, away
+    from it up."""
     loose: Bool[Tensor, "n"]
     """Away from the surface that is known: foliage, branches, the far background."""
     catches: Float[Tensor, "n"]
@@ -102,8 +104,11 @@ def _ground(
     apart = torch.where(flat[:, None], own, up)
     normals = torch.where(loose[:, None], apart, found.normals)
     starts = torch.where(loose[:, None], metric.means + OFF * up, found.points + OFF * found.normals)
-    level = torch.where(loose | ~flat, UNEVEN, (own * normals).sum(1).square())
-    return starts, normals, loose, level
+    cosine = (own * normals).sum(1)
+    level = torch.where(loose | ~flat, UNEVEN, cosine.square())
+    # A captured surface is rough by its voxels; Gaussians that lie in it know its slope better.
+    turned = own * torch.where(cosine < 0, -1.0, 1.0)[:, None]
+    return starts, torch.where((level > LEVEL)[:, None], turned, normals), loose, level
 
 
 def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor, "n"]:

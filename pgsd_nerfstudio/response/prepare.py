@@ -16,11 +16,11 @@ from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
-from pgsd_nerfstudio.response.exposure import Exposure
+from pgsd_nerfstudio.response.exposure import LEVEL, Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers
 from pgsd_nerfstudio.response.light import linear, luminance
-from pgsd_nerfstudio.response.sunlight import find_sunlight, lit, overcast_factor
+from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
@@ -30,7 +30,7 @@ from pgsd_nerfstudio.weather.effect import Effect
 SOLID = 0.3  # opacity from which a Gaussian's colour is asked for the sun
 NEIGHBOURS = 16
 MOST_SOFTENING = 3.0  # a shadow's colours hold noise and bounced light, which would shine
-_REVISION = 1  # of what is computed; stored answers of another one are not used
+_REVISION = 2  # of what is computed; stored answers of another one are not used
 
 
 def answer_of(
@@ -136,9 +136,7 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     """Factor on linear light when the ambience's clouds have come; None where they change nothing or no sun is found."""
     if effect.ambience is None or effect.ambience.clouds == 0:
         return None
-    light = luminance(linear(metric.colors))
-    asked = ~exposure.loose & (metric.opacities > SOLID)
-    sun = find_sunlight(metric.means[asked], exposure.normals[asked], light[asked], surface)
+    sun = sun_of(metric, exposure, surface)
     if sun is None:
         return None
     seen = lit(sun, metric.means, exposure.normals, surface)
@@ -146,3 +144,10 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     # Shadows of a mesh lie some centimetres beside those of the picture: what neighbours share leaves no bright rims.
     _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
     return factor.log()[torch.from_numpy(around).reshape(len(factor), -1)].mean(1).exp()
+
+
+def sun_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh) -> Sunlight | None:
+    """The sun by the shadows in a scene's own colours, asked of what lies smoothly in its surface; None: there is none."""
+    asked = (exposure.level > LEVEL) & (metric.opacities > SOLID)
+    light = luminance(linear(metric.colors))
+    return find_sunlight(metric.means[asked], exposure.normals[asked], light[asked], surface)

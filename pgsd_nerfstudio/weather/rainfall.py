@@ -16,21 +16,21 @@ WATER = Material(mass_milligram=0.5236, mass_exponent=3.0, speed_law="rain")  # 
 RAINFALL = register(
     Effect(
         name="rainfall",
-        emission=Emission(kind="raindrops", intensity=12.0, smallest=0.0010, largest=0.005, importance=1.5),
+        emission=Emission(kind="raindrops", intensity=20.0, smallest=0.0010, largest=0.005, importance=1.5),
         material=WATER,
         wind=Wind(speed=2.0, turbulence=0.25, flutter=0.0),
         surface=SurfaceResponse(landing="wets", splash=Splash(), accumulates=False, darkens=0.012),
         appearance=Appearance(
             active=StateLook(
-                scale_per_diameter=(1.5, 1.5, 1.5),
+                scale_per_diameter=(2.2, 2.2, 2.2),
                 scale_spread=0.0,
                 opacity=0.97,
                 opacity_spread=0.2,
                 fades_below=1.2e-3,
-                rgb=(0.88, 0.91, 0.95),
+                rgb=(0.92, 0.94, 0.97),
                 tone_spread=0.1,
             ),
-            exposure=1 / 50,
+            exposure=1 / 90,
         ),
         haze=Haze(rgb=(0.62, 0.66, 0.70)),
         ambience=Ambience(clouds=0.95, stops=-0.3, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),
