@@ -80,8 +80,8 @@ def _ratio(new: Any, old: Any) -> Any:
 
 
 def purple(base: Effect) -> dict[str, Any]:
-    """What a purple wish changes: air and sky go 35 % of the way between flakes and drops, 90 % where they are the matter."""
-    share = 0.35 if base.emission.precipitates else 0.9
+    """What a purple wish changes: air and sky go 35 % of the way between flakes and drops, 60 % where they are the matter."""
+    share = 0.35 if base.emission.precipitates else 0.6
     owns = {"haze.rgb": base.haze.rgb, "ambience.sky": base.ambience.sky} if base.haze and base.ambience else {}
     air = {
         name: tuple(round(((1 - share) * old + share * new) / old, 9) for old, new in zip(own, PURPLE, strict=True))

@@ -39,8 +39,7 @@ class Exposure:
     """N Gaussians in a weather."""
 
     normals: Float[Tensor, "n 3"]
-    """Unit, metric: a flat Gaussian's own, turned to the surface's open side; of others in the surface that of the surface, away
-    from it up."""
+    """Unit, metric: a flat Gaussian's own, turned to the surface's open side; else the surface's, and away from it up."""
     loose: Bool[Tensor, "n"]
     """Away from the surface that is known: foliage, branches, the far background."""
     catches: Float[Tensor, "n"]

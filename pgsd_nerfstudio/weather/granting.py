@@ -24,7 +24,7 @@ GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
 """Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
 is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the
 snowflakes are opaque and the rest fade."""
-HAZE_SHARE, MATTER_SHARE = 0.35, 0.9
+HAZE_SHARE, MATTER_SHARE = 0.35, 0.6
 """Part of the way from the base's haze to the colour of what flies. Between flakes and drops it is mostly the same air; fog and
 dust are the haze themselves."""
 

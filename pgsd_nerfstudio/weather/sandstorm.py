@@ -36,7 +36,7 @@ SANDSTORM = register(
         dense=Dense(matter="sand", young=1e5, friction=0.6),
         appearance=Appearance(
             active=StateLook(
-                scale_m=(0.005, 0.005, 0.005),
+                scale_m=(0.006, 0.006, 0.006),
                 scale_spread=0.5,
                 opacity=0.97,
                 opacity_spread=0.15,
@@ -46,7 +46,7 @@ SANDSTORM = register(
             collided=StateLook(
                 scale_spread=0.4, opacity=0.35, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
             ),
-            exposure=1 / 100,
+            exposure=1 / 150,
         ),
         haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=1.0, patch_size=5.0),
         ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
