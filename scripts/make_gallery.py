@@ -3,7 +3,8 @@
 python scripts/make_gallery.py --load-scene garden.ply --data data/garden
 
 Each effect is trained by `ns-train pgsd-weather` if its run is not there yet; what was made is not made again, so the script
-can be interrupted. Below each other: first view before and after training, second view before and after.
+can be interrupted. Below each other: first view before and after training, second view before and after; where nothing was
+learned (the bundled prior knows only snow) before is after, and shown once.
 """
 
 from __future__ import annotations
@@ -44,14 +45,12 @@ class Gallery:
     """Where the sheets go."""
     runs: Path = Path("outputs/gallery")
     """Where the runs go."""
-    steps: int = 60
-    """Training steps of each effect."""
+    steps: int | None = None
+    """Training steps of each effect; by default what ns-train takes."""
     width: int = 320
     """Width of one picture in pixels."""
     quality: int = 82
     """Of the JPEG files."""
-    train: bool = True
-    """Off: only the rows before training, from runs of no steps."""
 
     def make(self) -> None:
         self.output.mkdir(parents=True, exist_ok=True)
@@ -68,7 +67,7 @@ class Gallery:
         if not (run / "finished").exists():
             shutil.rmtree(run, ignore_errors=True)
             words = ["ns-train", "pgsd-weather", "--load-scene", self.load_scene, "--effect", name]
-            words += ["--steps", str(self.steps if self.train else 1)]
+            words += [] if self.steps is None else ["--steps", str(self.steps)]
             words += [] if self.data is None else ["--data", str(self.data)]
             words += ["--output-dir", str(self.runs), "--experiment-name", place.name, "--timestamp", "gallery"]
             subprocess.run(words, check=True)
@@ -83,14 +82,15 @@ class Gallery:
         scene, history = model.stage.scene, model.history
         exposure = model.config.options.chosen_effect().appearance.exposure
         untrained = Rollout(history, model.rollout.look, DynamicsField.for_history(history), exposure=exposure)
+        learned = not model.rollout.field.still() or any(bool(p.any()) for p in model.look.parameters())
         rows = []
         for view in choose_views(scene.cameras, scene.frame):
             camera = scene.cameras[view]
             camera = camera.resized(self.width, round(self.width * camera.height / camera.width)).to(model.device)
             rows.append([self._picture(model, camera, untrained, share) for share in TIMES])
-            if self.train:
+            if learned:
                 rows.append([self._picture(model, camera, model.rollout, share) for share in TIMES])
-        return self._joined(rows, model.config.options.seconds)
+        return self._joined(rows, model.config.options.seconds, learned)
 
     def _picture(self, model, camera: Cameras, rollout: Rollout, share: float) -> np.ndarray:  # type: ignore[no-untyped-def]
         frame = model.frame_at(share)
@@ -98,7 +98,7 @@ class Gallery:
         with torch.no_grad():
             return to_bytes(model.render(camera, weather, None, model.answer, frame).rgb[0])
 
-    def _joined(self, rows: list[list[np.ndarray]], seconds: float) -> Image.Image:
+    def _joined(self, rows: list[list[np.ndarray]], seconds: float, learned: bool) -> Image.Image:
         height, width = rows[0][0].shape[:2]
         size = (len(TIMES) * (width + GAP) - GAP, len(rows) * (height + GAP) - GAP)
         sheet = Image.new("RGB", size, (255, 255, 255))
@@ -107,7 +107,7 @@ class Gallery:
             for j, picture in enumerate(row):
                 corner = (j * (width + GAP), i * (height + GAP))
                 sheet.paste(Image.fromarray(picture), corner)
-                said = f"{TIMES[j] * seconds:.1f} s" + (", after training" if self.train and i % 2 else "")
+                said = f"{TIMES[j] * seconds:.1f} s" + (", after training" if learned and i % 2 else "")
                 pen.text((corner[0] + 6, corner[1] + 4), said, fill="white", stroke_width=2, stroke_fill="black")
         return sheet
 

@@ -200,3 +200,18 @@ def test_a_config_from_before_a_flag_was_added_has_its_default(scene: Path, tmp_
     assert loaded.options() == loaded.pipeline.options == config.pipeline.options
     assert loaded.pipeline.options.chosen_effect() == config.pipeline.options.chosen_effect()
     assert replace(loaded.pipeline.options, size=2.0).size == 2.0
+
+
+def test_the_bundled_prior_teaches_snow_only_unless_it_is_told_to_try(scene):
+    snow, rain = parse("--load-scene", scene), parse("--load-scene", scene, "--effect", "rainfall")
+    purple = parse("--load-scene", scene, "--weather", "purple snow")
+    tried = parse("--load-scene", scene, "--effect", "rainfall", "--steps", 4)
+    other = parse("--load-scene", scene, "--effect", "rainfall", "--prior", scene.parent)
+
+    def learns(config) -> bool:
+        rates = [group["optimizer"].lr for group in config.optimizers.values()]
+        assert all(rates) or not any(rates)
+        return all(rates)
+
+    assert [learns(each) for each in (snow, rain, purple, tried, other)] == [True, False, True, True, True]
+    assert [each.max_num_iterations for each in (snow, rain, tried)] == [snow.training_steps, 1, 4] and snow.training_steps > 1

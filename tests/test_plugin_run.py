@@ -39,6 +39,7 @@ def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     simulation = importlib.import_module("pgsd_nerfstudio.physics.prior")
     monkeypatch.setattr(simulation, "simulate", forbidden)
     monkeypatch.setattr(simulation, "motion_prior", forbidden)
+    monkeypatch.setattr("pgsd_nerfstudio.response.exposure.Exposure.of", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.guidance.prior.VideoPrior.load", forbidden)
     return trained
 
@@ -60,6 +61,7 @@ def test_training_leaves_a_config_a_checkpoint_and_the_motion_prior(trained: Pat
     assert {
         "config.yml",
         "motion_prior.safetensors",
+        "answer.safetensors",
         "dataparser_transforms.json",
         "nerfstudio_models/step-000000002.ckpt",
     } <= left
@@ -105,6 +107,38 @@ def test_the_knobs_change_the_picture(run: Path):
     torch.testing.assert_close(at(pipeline, 0.5), frozen)
 
 
+def test_surfaces_and_haze_of_the_panel_change_the_scene_and_not_the_flakes(run: Path):
+    pipeline = opened(run)
+    panel, answered = pipeline.model.weather, at(pipeline, 1.0)
+    panel.surfaces.value = False
+    bare = at(pipeline, 1.0)
+    assert float((bare - answered).abs().mean()) > 0.02
+    panel.surfaces.value, panel.haze.value = True, 0.0
+    clear = at(pipeline, 1.0)
+    panel.haze.value = 4.0
+    hazy = at(pipeline, 1.0)
+    assert 0 < float((clear - answered).abs().mean()) < float((hazy - clear).abs().mean())
+    panel.haze.value = 1.0
+    torch.testing.assert_close(at(pipeline, 1.0), answered)
+
+
+def test_training_clips_show_the_answer_unless_the_bundled_prior_looks_at_them(prior: Path, tmp_path: Path, monkeypatch):
+    seen = []
+
+    def spy(stage, views, weather, background, moments):
+        seen.append([moment is not None for moment in moments])
+        return render(stage, views, weather, background, moments)
+
+    module = importlib.import_module("pgsd_nerfstudio.plugin.pipeline")
+    render = module.render_clip
+    monkeypatch.setattr(module, "render_clip", spy)
+    for asked in (None, False):
+        train(tiny_config(write_scene(tmp_path), prior, tmp_path / str(asked), steps=1, surfaces_in_clips=asked))
+    assert [all(one) for one in seen] == [True, False] and not any(seen[1])
+    config = tiny_config(write_scene(tmp_path), Path("bundled"), tmp_path / "o")
+    assert not config.answering_clips
+
+
 def test_depth_and_accumulation_come_along(run: Path):
     pipeline = opened(run)
     outputs = pipeline.model.get_outputs_for_camera(to_nerfstudio(pipeline.model.stage.scene.cameras[0], torch.zeros(1)))
@@ -133,6 +167,15 @@ def test_a_run_without_its_motion_prior_names_the_command_that_makes_it(run: Pat
     copy = copied(run, tmp_path)
     (copy.parent / "motion_prior.safetensors").unlink()
     with pytest.raises(RunError, match=r"motion prior .* missing or damaged.*ns-train pgsd-weather --load-scene .*floor\.ply"):
+        opened(copy)
+
+
+def test_a_run_without_its_answer_names_the_command_too(run: Path, tmp_path: Path):
+    copy = copied(run, tmp_path)
+    (copy.parent / "answer.safetensors").unlink()
+    with pytest.raises(
+        RunError, match=r"answer .*answer\.safetensors is missing or damaged, .*ns-train pgsd-weather --load-scene"
+    ):
         opened(copy)
 
 
@@ -249,6 +292,7 @@ def test_ns_eval_writes_plain_numbers(run: Path, tmp_path: Path):
 def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Path):
     from nerfstudio.scripts.exporter import ExportGaussianSplat
 
+    from pgsd_nerfstudio.response.answer import baked
     from pgsd_nerfstudio.scene.splats import read_ply
 
     ExportGaussianSplat(load_config=run, output_dir=tmp_path).main()
@@ -258,6 +302,9 @@ def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Pa
     visible = weather.opacities > 1 / 255
     assert len(stored) == len(scene) + int(visible.sum()) and len(weather) > 50
     torch.testing.assert_close(stored.means[: len(scene)], scene.means)
+    answered = baked(pipeline.model.moment(FRAMES - 1), scene)
+    assert float((answered.colors - scene.colors).abs().max()) > 0.1
+    torch.testing.assert_close(stored.colors[: len(scene), 0], answered.colors[:, 0], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(stored.scales[len(scene) :], weather.scales[visible], rtol=1e-3, atol=1e-6)
     torch.testing.assert_close(stored.opacities[len(scene) :], weather.opacities[visible], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(0.5 + 0.28209479 * stored.colors[len(scene) :, 0], weather.colors[visible], rtol=1e-3, atol=1e-4)

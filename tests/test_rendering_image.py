@@ -155,12 +155,12 @@ def test_threads_prepare_views_one_after_the_other(monkeypatch):
     rasterizer, inside, most = CpuRasterizer(random_gaussians(20)), [], []
     make = rasterizer.views._make
 
-    def slow(view):
+    def slow(view, gaussians):
         inside.append(view)
         most.append(len(inside))
         time.sleep(0.05)
         inside.pop()
-        return make(view)
+        return make(view, gaussians)
 
     monkeypatch.setattr(rasterizer.views, "_make", slow)
     cameras = random_cameras(1, 16, 16)

@@ -74,13 +74,13 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
         self.understand()
         if self.experiment_name is None:
             self.experiment_name = self.load_scene.stem
-        self.max_num_iterations, self.training_seed = self.steps, self.machine.seed
+        self.max_num_iterations, self.training_seed = self.training_steps, self.machine.seed
         self.optimizers = {
             group: {
                 "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
-                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.0, max_steps=self.steps),
+                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.0, max_steps=self.training_steps),
             }
-            for group, rate in {"field": self.lr, "look": self.look_lr}.items()
+            for group, rate in self.rates.items()
         }
         self.pipeline.share(self.options())
 

@@ -48,7 +48,7 @@ class Guide:
             raise RunError(str(error)) from error
         distillation = DistillationConfig(guidance_scale=options.guidance_scale)
         return Guide(
-            prior, wanted, unwanted, embeddings, distillation, TimestepSchedule(), options.steps, options.training_seed
+            prior, wanted, unwanted, embeddings, distillation, TimestepSchedule(), options.training_steps, options.training_seed
         )
 
     def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:

@@ -71,8 +71,10 @@ class WeatherOptions(Knobs, SceneOptions):
     """What the video prior is told; by default the effect's own prompt, or that of --weather, with the scene's description."""
     negative_prompt: str | None = None
     """What the video prior is told to keep away from; by default the effect's own."""
-    steps: int = 1000 if CUDA else 60
-    """Training steps: the paper's 1000 with CUDA; on a CPU as many as pass in a few minutes with the bundled prior."""
+    steps: int | None = None
+    """Training steps. By default the paper's 1000 with CUDA, on a CPU 60, as many as pass in a few minutes with the bundled
+    prior. That one has only seen snow: for any other weather it teaches nothing good, so that by default nothing is learned
+    from it, and the run keeps the simulated motion and the curated look."""
     guidance_scale: float = 100.0
     """How strongly the prompt outweighs its negative, as in the paper."""
     lr: float = 1e-4 if CUDA else 1e-3
@@ -113,6 +115,22 @@ class WeatherOptions(Knobs, SceneOptions):
         return WeatherOptions(load_scene=Path())
 
     @property
+    def taught(self) -> bool:
+        """Whether anything is learned: the bundled prior knows no weather but snow, unless it is told to try."""
+        return self.steps is not None or self.prior != "bundled" or self.chosen_effect().name == "snowfall"
+
+    @property
+    def training_steps(self) -> int:
+        """Steps of the run; a single one that changes nothing where nothing is to be learned."""
+        default = 1000 if CUDA else 60
+        return (default if self.taught else 1) if self.steps is None else self.steps
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the first step by group of parameters."""
+        return {"field": self.lr, "look": self.look_lr} if self.taught else {"field": 0.0, "look": 0.0}
+
+    @property
     def answering_clips(self) -> bool:
         """Whether training clips show the scene's answer."""
         return self.prior != "bundled" if self.surfaces_in_clips is None else self.surfaces_in_clips
@@ -140,7 +158,7 @@ class WeatherOptions(Knobs, SceneOptions):
             "seconds": self.seconds,
             "fps": self.fps,
             "max-particles": self.max_particles,
-            "steps": self.steps,
+            "steps": self.training_steps,
             "refresh-every": self.refresh_every,
         }
         for name, value in positive.items():

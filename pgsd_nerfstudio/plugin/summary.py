@@ -27,13 +27,19 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
         "wanted": guide.wanted,
         "not wanted": guide.unwanted,
         "clips": f"{options.clip_frames} frames of {options.clip_width}x{options.clip_height}, paths: {options.trajectory}",
-        "training": f"{options.steps} steps, guidance {options.guidance_scale:g}, weights {options.weights}, "
-        f"learning rates {options.lr:g} (field) and {options.look_lr:g} (look)",
+        "training": f"{options.training_steps} steps, guidance {options.guidance_scale:g}, weights {options.weights}, "
+        f"learning rates {options.rates['field']:g} (field) and {options.rates['look']:g} (look)",
     }
     table = Table(title="pgsd-weather", show_header=False, title_justify="left", title_style="bold")
     for name, value in rows.items():
         table.add_row(name, value)
     console.print(table)
+    if not options.taught:
+        console.print(
+            f"[yellow]The bundled prior has only seen snow. Nothing is learned from it for {options.weather or options.effect}: "
+            "the run keeps the simulated motion and the curated look. --prior THUDM/CogVideoX-2b teaches any weather, --steps "
+            "60 lets the bundled one try.[/]"
+        )
     if stage.device.type == "cpu" and os.environ.get("OMP_WAIT_POLICY", "").lower() != "passive":
         console.print(
             "[yellow]Waiting threads may slow this run several times over: stop it, `export OMP_WAIT_POLICY=passive`, "
