@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
-HOUSE = ["scene", "rendering", "surface", "weather", "physics", "dynamics", "guidance", "evaluation", "export"]
+HOUSE = ["scene", "rendering", "surface", "weather", "physics", "response", "dynamics", "guidance", "evaluation", "export"]
 NERFSTUDIO = {"ns-train", "ns-viewer", "ns-render", "ns-eval", "ns-export"}
 
 

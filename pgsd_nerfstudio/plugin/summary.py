@@ -35,10 +35,10 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
         table.add_row(name, value)
     console.print(table)
     if not options.taught:
+        name = options.weather or options.effect
         console.print(
-            f"[yellow]The bundled prior has only seen snow. Nothing is learned from it for {options.weather or options.effect}: "
-            "the run keeps the simulated motion and the curated look. --prior THUDM/CogVideoX-2b teaches any weather, --steps "
-            "60 lets the bundled one try.[/]"
+            f"[yellow]The bundled prior has only seen snow. Nothing is learned from it for {name}: the run keeps the simulated "
+            "motion and the curated look. --prior THUDM/CogVideoX-2b teaches any weather; --steps 60 lets the bundled try.[/]"
         )
     if stage.device.type == "cpu" and os.environ.get("OMP_WAIT_POLICY", "").lower() != "passive":
         console.print(
