@@ -2,14 +2,15 @@
 
 Architecture of the paper's supplement, "Implementation Details": one network per physical state, each a backbone of two hidden
 layers of 128 with ReLU and one linear head per quantity. The heads start at zero, so that an untrained field changes nothing,
-and every output is bounded by construction (bound x tanh), so that no weights can make a roll-out explode.
+and every output is bounded by construction (bound x tanh), so that no weights can make a roll-out explode. What the paper's
+ablation "Per-Particle Appearance and Rotation" takes away can be left out (FieldConfig).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -22,7 +23,8 @@ from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.weather.appearance import ParticleLook
 
 HIDDEN = 128
-APPEARANCE = 7  # opacity 1, scale 3, colour 3
+LOOK = {"opacity": 1, "scale": 3, "rgb": 3}  # heads of the appearance
+PARTICLE = 3 * WIDTH + sum(LOOK.values())  # inputs of one particle: place, velocity and time, and its appearance
 REFERENCE_SCALE = 0.01  # m; scales enter as the logarithm of their ratio to it, since metres of a flake are all but zero
 
 
@@ -42,6 +44,17 @@ class DeltaBounds:
     """Change of colour per frame."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FieldConfig:
+    """What the field may change."""
+
+    rotation: bool = True
+    """Whether particles in the air turn; off there is no angular velocity to learn and orientations stay the simulated ones."""
+    appearance: Literal["per particle", "shared", "fixed"] = "per particle"
+    """How the look changes from frame to frame. "per particle": by place, velocity, time and look. "shared": by time alone, one
+    change per state and frame for all particles. "fixed": not at all, and the look that all share is not learned either."""
+
+
 class ActiveDelta(NamedTuple):
     """What the field adds to n particles in the air in one frame."""
 
@@ -53,11 +66,11 @@ class ActiveDelta(NamedTuple):
 
 
 class StateNet(nn.Module):
-    """The network of one physical state."""
+    """The network of one physical state; without heads it is never evaluated."""
 
-    def __init__(self, heads: dict[str, int]) -> None:
+    def __init__(self, heads: dict[str, int], inputs: int = PARTICLE) -> None:
         super().__init__()
-        self.first = nn.Linear(3 * WIDTH + APPEARANCE, HIDDEN)
+        self.first = nn.Linear(inputs, HIDDEN)
         self.second = nn.Linear(HIDDEN, HIDDEN)
         self.heads = nn.ModuleDict({name: nn.Linear(HIDDEN, width) for name, width in heads.items()})
         for head in self.heads.parameters():
@@ -83,32 +96,42 @@ class DynamicsField(nn.Module):
         speed: float,  # m per frame, of the fastest particle
         frames: int,
         bounds: DeltaBounds | None = None,
+        config: FieldConfig | None = None,
     ) -> None:
         super().__init__()
-        self.frames, self.bounds = frames, bounds or DeltaBounds()
+        self.frames, self.bounds, self.config = frames, bounds or DeltaBounds(), config or FieldConfig()
         self.register_buffer("box", box.detach().clone().float())
         self.register_buffer("speed", torch.tensor(max(float(speed), 1e-6)))
-        appearance = {"opacity": 1, "scale": 3, "rgb": 3}
-        self.active_net = StateNet({"velocity": 3, "rotation": 3, **appearance})
-        self.collided_net = StateNet(appearance)
+        motion = {"velocity": 3, "rotation": 3} if self.config.rotation else {"velocity": 3}
+        own = LOOK if self.config.appearance == "per particle" else {}
+        self.active_net = StateNet({**motion, **own})
+        self.collided_net = StateNet(own)
+        shared = ("active", "collided") if self.config.appearance == "shared" else ()
+        self.shared_nets = nn.ModuleDict({state: StateNet(LOOK, WIDTH) for state in shared})
 
     @staticmethod
-    def for_history(history: ParticleHistory, bounds: DeltaBounds | None = None) -> DynamicsField:
+    def for_history(
+        history: ParticleHistory, bounds: DeltaBounds | None = None, config: FieldConfig | None = None
+    ) -> DynamicsField:
         """A field for these particles: domain box and fastest speed come from their trajectories."""
         if history.positions.shape[0] == 0:
-            return DynamicsField(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, history.frames, bounds)
+            return DynamicsField(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, history.frames, bounds, config)
         low, high = history.positions.aminmax(dim=0)
         steps = (history.positions[1:] - history.positions[:-1]).norm(dim=1)
         same = torch.ones_like(steps, dtype=torch.bool)
         between = history.offsets[1:-1]  # rows where the next particle starts; a particle without rows repeats its neighbour's
         same[between[(between > 0) & (between <= steps.shape[0])] - 1] = False
         speed = float(steps[same].max()) if bool(same.any()) else 0.0
-        return DynamicsField(torch.stack([low, high]), speed, history.frames, bounds).to(history.device)
+        return DynamicsField(torch.stack([low, high]), speed, history.frames, bounds, config).to(history.device)
 
     def still(self) -> bool:
         """Whether the field changes nothing at all: every head is zero, as before training."""
-        nets = (self.active_net, self.collided_net)
-        return not any(bool(parameter.any()) for net in nets for parameter in net.heads.parameters())
+        return not any(bool(parameter.any()) for head in self.heads() for parameter in head.parameters())
+
+    def heads(self) -> list[nn.Module]:
+        """The last layers of all networks: what is learned is zero where they are."""
+        nets = [self.active_net, self.collided_net, *self.shared_nets.values()]
+        return [head for net in nets for head in net.heads.values()]  # type: ignore[union-attr, operator]
 
     def active(
         self,
@@ -120,25 +143,38 @@ class DynamicsField(nn.Module):
         """Corrections for particles in the air."""
         own = torch.cat([self._place(position), _appearance(look), fourier((velocity / self.speed).clamp(-1, 1))], dim=1)
         out = self.active_net(own, self._time(frame))
-        bounds = self.bounds
-        return ActiveDelta(bounds.velocity * out["velocity"], bounds.rotation * out["rotation"], self._change(out))
+        rotation = self.bounds.rotation * out["rotation"] if self.config.rotation else torch.zeros_like(position)
+        return ActiveDelta(self.bounds.velocity * out["velocity"], rotation, self._change("active", out, frame, position))
 
     def collided(self, position: Float[Tensor, "n 3"], frame: int, look: ParticleLook) -> Change:
         """Changes for particles at rest; their motion is fixed, their velocity enters as zero."""
+        if self.config.appearance != "per particle":
+            return self._change("collided", {}, frame, position)
         own = torch.cat([self._place(position), _appearance(look)], dim=1)
         shared = torch.cat([fourier(position.new_zeros(1, 3)), self._time(frame)], dim=1)
-        return self._change(self.collided_net(own, shared))
+        return self._change("collided", self.collided_net(own, shared), frame, position)
 
     def _place(self, position: Tensor) -> Float[Tensor, "n 24"]:
-        low, high = self.box
-        return fourier((2 * (position - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1))
+        return fourier(within(self.box, position))
 
     def _time(self, frame: int) -> Float[Tensor, "1 24"]:
         return sinusoidal(frame / self.frames, self.box)
 
-    def _change(self, out: dict[str, Tensor]) -> Change:
-        bounds = self.bounds
+    def _change(self, state: str, out: dict[str, Tensor], frame: int, like: Float[Tensor, "n 3"]) -> Change:
+        """The change of n particles from the heads of their own network, or from where the config says."""
+        bounds, count = self.bounds, len(like)
+        if self.config.appearance == "fixed":
+            return Change.none(count, like)
+        if self.config.appearance == "shared":
+            one = self.shared_nets[state](like.new_zeros(1, 0), self._time(frame))
+            out = {name: value.expand(count, -1) for name, value in one.items()}
         return Change(bounds.opacity * out["opacity"][:, 0], bounds.log_scale * out["scale"], bounds.rgb * out["rgb"])
+
+
+def within(box: Float[Tensor, "2 3"], position: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Positions as -1..1 between the corners of a box; what lies outside counts as on its wall."""
+    low, high = box
+    return (2 * (position - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
 
 
 def _appearance(look: ParticleLook) -> Float[Tensor, "n 7"]:

@@ -7,7 +7,8 @@ sqrt(x^2 + eps^2) - eps with eps = 1e-6: the same for all that matters, zero at 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import roma
 import torch
@@ -15,9 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.look import Change, LearnedLook
-from pgsd_nerfstudio.dynamics.rollout import RolledFrame
+from pgsd_nerfstudio.dynamics.rollout import Begin, RolledFrame, Rollout
 
 EPSILON = 1e-6
+APPEARANCE = tuple(f"{state}_{name}" for state in ("active", "collided") for name in ("opacity", "scale", "rgb"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +46,33 @@ class RegularizationWeights:
     """Change of colour per frame, after landing."""
     look: float = 0.01
     """Shift of the look that all particles share; not in the paper, which regularizes changes from frame to frame only."""
+    without: tuple[str, ...] = ()
+    """Terms to leave out, by the names above; "app" names all six of the appearance per frame, as the paper's ablation does."""
+    times: float = 1.0
+    """Factor on all terms; the paper's study of sensitivity tries 0.1 and 10, on one term at a time."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError: a term to leave out does not exist, or the factor is negative."""
+        known = [f.name for f in fields(self) if f.name not in ("without", "times")] + ["app"]
+        unknown = [name for name in self.without if name not in known]
+        if unknown:
+            raise ValueError(f"terms to leave out must be among {', '.join(known)}; found {', '.join(unknown)}")
+        if not self.times >= 0:
+            raise ValueError(f"the factor on all terms must not be negative, got {self.times}")
+
+    def of(self, name: str) -> float:
+        """The weight of one term as it is used; zero where it is left out."""
+        out = name in self.without or ("app" in self.without and name in APPEARANCE)
+        return 0.0 if out else self.times * getattr(self, name)
+
+    def weighted(self, terms: Mapping[str, Tensor], scale: float = 1.0) -> dict[str, Tensor]:
+        """Each term times its weight and `scale`, without those of weight zero."""
+        return {name: scale * self.of(name) * value for name, value in terms.items() if self.of(name)}
 
     def total(self, terms: Mapping[str, Tensor], scale: float = 1.0) -> Tensor:
         """Weighted sum of `terms`, times `scale`."""
-        return scale * torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
+        used = [self.of(name) * value for name, value in terms.items() if self.of(name)]
+        return scale * torch.stack(used).sum() if used else torch.zeros_like(next(iter(terms.values())))
 
 
 def regularization(clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None) -> dict[str, Tensor]:
@@ -84,8 +109,49 @@ def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Te
 
 def drift(frames: Iterable[RolledFrame]) -> float:
     """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
-    means = [float(rolled.offset.detach().norm(dim=1).mean()) for rolled in frames if len(rolled.active)]
-    return sum(means) / len(means) if means else 0.0
+    return _average(_distance(rolled) for rolled in frames)
+
+
+class Gap(NamedTuple):
+    """How far clips are from what they are cut from; metres."""
+
+    clips: float
+    """Drift of the clips as training sees them."""
+    rollout: float
+    """Drift of the whole roll-out with the present weights, at the same frames."""
+    difference: float
+    """The second minus the first: the drift that training does not see."""
+
+
+@torch.no_grad()
+def gap(rollout: Rollout, windows: Sequence[tuple[int, int]], *, begin: Begin = "simulation") -> Gap:
+    """Drift of training clips against that of the roll-out which is shown in the end, at the same frames.
+
+    Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at the
+    roll-out start from kept states: with those of the present weights the gap is zero, else it is what stale ones cost.
+
+    Args:
+        rollout: its kept states are left as they are.
+        windows: (first frame, number of frames) of each clip.
+        begin: where the clips start from.
+
+    Raises:
+        IndexError: a clip leaves the sequence.
+    """
+    clips = [rolled for start, frames in windows for rolled in rollout.window(start, frames, begin=begin)]
+    whole = {rolled.frame: _distance(rolled) for rolled in rollout.afresh({rolled.frame for rolled in clips})}
+    seen, shown = _average(_distance(rolled) for rolled in clips), _average(whole[rolled.frame] for rolled in clips)
+    return Gap(seen, shown, shown - seen)
+
+
+def _distance(rolled: RolledFrame) -> float | None:
+    """Mean distance in metres of one frame; None where no particle is in the air."""
+    return float(rolled.offset.detach().norm(dim=1).mean()) if len(rolled.active) else None
+
+
+def _average(distances: Iterable[float | None]) -> float:
+    found = [distance for distance in distances if distance is not None]
+    return sum(found) / len(found) if found else 0.0
 
 
 def _appearance(state: str, changes: Sequence[Change], mean: _Mean) -> dict[str, Tensor]:

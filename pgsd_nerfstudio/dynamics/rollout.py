@@ -7,8 +7,9 @@ one clip would be waste, so `refresh` does it once in a while and keeps a state 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -18,11 +19,14 @@ from torch import Tensor
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
 from pgsd_nerfstudio.dynamics.state import Deltas, State, advance, fading, simulated
+from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 Progress = Callable[[int, int], None]
+Begin = Literal["rollout", "simulation"]
+Motion = Literal["particle", "field"]
 
 
 @dataclass(frozen=True)
@@ -57,15 +61,23 @@ class Rollout:
         *,
         stride: int = 25,
         exposure: float = 0.0,
+        motion: Motion = "particle",
     ) -> None:
         """`stride` frames lie between kept states; all parts must be on one device.
 
         With an `exposure` in seconds the Gaussians in the air carry how far the simulation moves them in that time.
+        `motion`: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or that
+        of the place where it is ("field", see VelocityField); both lead to the simulated contact.
+
+        Raises:
+            ValueError: the stride is below one frame, or there is no such motion.
         """
         if stride < 1:
             raise ValueError(f"stride must be at least one frame, got {stride}")
+        if motion not in ("particle", "field"):
+            raise ValueError(f'motion must be "particle" or "field", got "{motion}"')
         self.history, self.look, self.field, self.learned_look, self.stride = history, look, field, learned_look, stride
-        self.exposure = exposure
+        self.exposure, self.motion = exposure, motion
         self._keyframes: dict[int, State] = {}
         self._stamp: tuple[int, ...] = ()
         self._last: State | None = None
@@ -87,14 +99,12 @@ class Rollout:
         """
         weights, keyframes = self._weights(), {}
         if not self.field.still():
-            look, state = self._learned(), simulated(self.history, 0)
-            keyframes[0], last = state, (len(self) - 1) // self.stride * self.stride
-            for frame in range(1, last + 1):
-                state, _ = advance(state, self.history, look, self.field)
-                if frame % self.stride == 0:
-                    keyframes[frame] = state
-                if progress:
-                    progress(frame, last)
+            last = (len(self) - 1) // self.stride * self.stride
+            for state in self._walk(last):
+                if state.frame % self.stride == 0:
+                    keyframes[state.frame] = state
+                if progress and state.frame:
+                    progress(state.frame, last)
         self._keyframes, self._stamp, self._last = keyframes, weights, None
 
     @torch.no_grad()
@@ -115,14 +125,30 @@ class Rollout:
         for frame in range(start, len(self) if stop is None else stop):
             yield self._rendered(self._reach(frame, None), look, None)
 
+    @torch.no_grad()
+    def afresh(self, frames: Collection[int]) -> Iterator[RolledFrame]:
+        """These frames in ascending order, rolled from the first of all with the present weights; kept states stay as they are.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        wanted = set(frames)
+        for frame in wanted:
+            self._check(frame)
+        look, last = self._learned(), max(wanted, default=-1)
+        still = self.field.still()
+        for state in (simulated(self.history, frame) for frame in sorted(wanted)) if still else self._walk(last):
+            if state.frame in wanted:
+                yield self._rendered(state, look, None)
+
     def window(
         self,
         start: int,
         frames: int,
         *,
         visible: Bool[Tensor, "p"] | None = None,
-        begin: Literal["rollout", "simulation"] = "rollout",
-        detach: bool = False,
+        begin: Begin = "rollout",
+        gradient_frames: int | None = None,
     ) -> list[RolledFrame]:
         """A clip with gradient to field and learned look: true recurrence from its first frame to its last.
 
@@ -132,29 +158,47 @@ class Rollout:
             visible: mask over all particles; only these are evaluated. None means all.
             begin: where the clip starts from: the state that the roll-out reaches at the frame before, or (the paper's code)
                 the simulated one.
-            detach: cut the gradient between frames, as the paper's code does.
+            gradient_frames: after so many steps of the recurrence the gradient is cut, as in truncated backpropagation through
+                time; None lets it run through the whole clip, 1 cuts it after every frame, as the paper's code does.
 
         Raises:
             IndexError: the clip leaves the sequence.
+            ValueError: `gradient_frames` is below one.
             FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
         """
         if frames < 1 or not 0 <= start <= len(self) - frames:
             raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {len(self)} frames")
+        if gradient_frames is not None and gradient_frames < 1:
+            raise ValueError(f"the gradient must run through at least one frame, got gradient_frames = {gradient_frames}")
         with torch.no_grad():
             before = max(start - 1, 0)
             reached = begin == "rollout" and start > 0
             state = self._reach(before, visible) if reached else simulated(self.history, before, visible)
         look = self._learned()
         clip = [self._rendered(state, look, None)] if start == 0 else []
-        while len(clip) < frames:
-            state, deltas = advance(state.detach() if detach else state, self.history, look, self.field, visible)
+        for step in range(frames - len(clip)):
+            if gradient_frames is not None and step % gradient_frames == 0:
+                state = state.detach()
+            state, deltas = advance(state, self.history, look, self.field, visible, self._flow)
             clip.append(self._rendered(state, look, deltas))
         for rolled in clip:
             _check_finite(rolled)
         return clip
 
+    @cached_property
+    def _flow(self) -> VelocityField | None:
+        return VelocityField.of(self.history) if self.motion == "field" else None
+
+    def _walk(self, last: int) -> Iterator[State]:
+        """The states of frames 0 .. last with the present weights."""
+        look, state = self._learned(), simulated(self.history, 0)
+        yield state
+        while state.frame < last:
+            state, _ = advance(state, self.history, look, self.field, None, self._flow)
+            yield state
+
     def _learned(self) -> InitialLook:
-        if self.learned_look is None:
+        if self.learned_look is None or self.field.config.appearance == "fixed":
             return self.look
         if not torch.is_grad_enabled() and not any(bool(p.any()) for p in self.learned_look.parameters()):
             return self.look
@@ -167,8 +211,7 @@ class Rollout:
 
     def _reach(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
         """The state at a frame, without gradient."""
-        if not 0 <= frame < len(self):
-            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
+        self._check(frame)
         if self.field.still():
             return simulated(self.history, frame, visible)
         if not self._keyframes:
@@ -179,10 +222,14 @@ class Rollout:
             state = last
         state, look = state.select(visible), self._learned()
         while state.frame < frame:
-            state, _ = advance(state, self.history, look, self.field, visible)
+            state, _ = advance(state, self.history, look, self.field, visible, self._flow)
         if visible is None:
             self._last = state
         return state
+
+    def _check(self, frame: int) -> None:
+        if not 0 <= frame < len(self):
+            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
 
     def _rendered(self, state: State, look: InitialLook, deltas: Deltas | None) -> RolledFrame:
         history = self.history

@@ -2,6 +2,10 @@
 
 The paper's x(t) = x(t-1) + v_sim(t) + dv is carried as the learned offset alone, d(t) = d(t-1) + dv with x = x_sim + d: the
 same sum, but a field that adds nothing reproduces the simulation bit for bit, however many frames it runs.
+
+A particle that has drifted goes on with the simulated motion of where it is not. With a velocity field V the step gains
+V(x) - V(x_sim): what the simulation does where the particle is rendered instead of where it was simulated. What is its own, such
+as the fall speed of its size, stays with it, and without drift nothing is added.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.field import ActiveDelta, DynamicsField
 from pgsd_nerfstudio.dynamics.look import Change, accumulate, changed
+from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.weather.appearance import InitialLook
 
@@ -93,6 +98,7 @@ def advance(
     look: InitialLook,
     field: DynamicsField,
     visible: Bool[Tensor, "p"] | None = None,
+    flow: VelocityField | None = None,
 ) -> tuple[State, Deltas]:
     """The state one frame later.
 
@@ -102,6 +108,7 @@ def advance(
         look: initial look of all particles.
         field: what is learned.
         visible: particles to follow; None means all.
+        flow: simulated velocities by place; None: every particle keeps to its own, wherever it is.
     """
     fresh = simulated(history, state.frame + 1, visible)
     frame, ids = fresh.frame, fresh.active
@@ -112,8 +119,12 @@ def advance(
     offset, quats = state.offset[stayed], state.quats[stayed]
     fade = fading(history, state.frame, ids)
     before, now = history.positions_at(state.frame, ids), history.positions_at(frame, ids)
+    here, motion = before + offset * fade[:, None], now - before
+    if flow is not None:
+        elsewhere = flow.at(frame, here) - flow.at(frame, before)
+        offset, motion = offset + elsewhere, motion + elsewhere
     flying = look.active.select(ids)
-    delta = field.active(before + offset * fade[:, None], now - before, frame, changed(flying, change.times(fade)))
+    delta = field.active(here, motion, frame, changed(flying, change.times(fade)))
 
     laid = history.ends[fresh.resting] < frame
     rest = fresh.resting[laid]
