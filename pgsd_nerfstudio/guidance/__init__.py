@@ -3,17 +3,28 @@
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, Distilled, DistilledClip, distill, distill_clip
 from pgsd_nerfstudio.guidance.folder import PriorError
 from pgsd_nerfstudio.guidance.prior import VideoPrior
-from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, Weighting, regularization_scale
+from pgsd_nerfstudio.guidance.prompts import Prompts, encode, prompts_for
+from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, WeightDecay, Weighting, regularization_scale
+from pgsd_nerfstudio.guidance.variants import Embeddings, Omega, Role, Variant, roles_of
 
 __all__ = [
     "DistillationConfig",
     "Distilled",
     "DistilledClip",
+    "Embeddings",
+    "Omega",
     "PriorError",
+    "Prompts",
+    "Role",
     "TimestepSchedule",
+    "Variant",
     "VideoPrior",
+    "WeightDecay",
     "Weighting",
     "distill",
     "distill_clip",
+    "encode",
+    "prompts_for",
     "regularization_scale",
+    "roles_of",
 ]

@@ -58,14 +58,16 @@ class MemoryMeter(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         made = func(*args, **(kwargs or {}))
+        given = {id(leaf.untyped_storage()) for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)}
         for leaf in tree_leaves(made):
-            if isinstance(leaf, Tensor):
+            # A view of something made before, such as a weight, or the same thing written to: nothing new is held.
+            if isinstance(leaf, Tensor) and id(leaf.untyped_storage()) not in given:
                 self._count(leaf)
         return made
 
     def _count(self, tensor: Tensor) -> None:
         storage = tensor.untyped_storage()
-        if id(storage) in self._held:  # a view, or an operator that wrote in place
+        if id(storage) in self._held:
             return
         size = storage.nbytes()
         self._held[id(storage)] = weakref.finalize(storage, self._free, id(storage), size)

@@ -6,6 +6,7 @@ transformer, T5, DDIM scheduler with v-prediction), so one class serves both; on
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.guidance.folder import PriorError, find_prior, stored_dtype
 from pgsd_nerfstudio.guidance.text import PromptEncoder
+from pgsd_nerfstudio.guidance.tiny_vae import LATENT_CHANNELS, SPACE, TIME, TinyEncoder
 
 HALF = {"F16": torch.float16, "BF16": torch.bfloat16}
 SMALL = 200_000_000  # parameters; below this half precision saves nothing that matters
@@ -46,6 +48,7 @@ class VideoPrior:
         self._space = 2 ** (len(vae.config.block_out_channels) - 1)
         self._time = int(vae.config.temporal_compression_ratio)
         self._rotary: dict[tuple[int, int, int], Any] = {}
+        self._tiny: TinyEncoder | None = None
         config = transformer.config
         native = int(config.sample_frames)
         self.clip_shape = (frames or native, config.sample_height * self._space, config.sample_width * self._space)
@@ -69,8 +72,8 @@ class VideoPrior:
             dtype: number format; None means float32 on a CPU and for small models, on CUDA the format its weights are stored in
                 (float16 for the 2B, bfloat16 for the 5B).
             frames: clip length, 4k + 1; None means the model's own (CogVideoX-2B: 49; the paper distils clips of 9).
-            checkpointing: recompute the VAE encoder's activations in the backward pass instead of keeping them (up to 21 GiB
-                for 9 frames of 480x720); None means on CUDA.
+            checkpointing: recompute the VAE encoder's activations in the backward pass instead of keeping them (23 GB for 9
+                frames of 480x720 in half precision, with the weights 29 GB at the peak; recomputed 13); None means on CUDA.
 
         Raises:
             PriorError: nothing usable is there; see `find_prior`.
@@ -104,6 +107,22 @@ class VideoPrior:
         """Text embeddings, one per text; cached on disk, the text encoder is loaded only when a text is new."""
         return self.text_encoder(texts)
 
+    def through(self, tiny: TinyEncoder) -> VideoPrior:
+        """The same prior with a small encoder in place of its VAE's in `encode`, for a cheaper and less exact gradient.
+
+        Raises:
+            PriorError: this prior's latents are of another shape.
+        """
+        found = (int(self.vae.config.latent_channels), self._space, self._time)
+        if found != (LATENT_CHANNELS, SPACE, TIME):
+            raise PriorError(
+                f"the tiny VAE is made for priors with {LATENT_CHANNELS} latent channels, {SPACE} pixels and {TIME} frames "
+                f"per latent, as CogVideoX has, but {self.name} has {found[0]}, {found[1]} and {found[2]}"
+            )
+        other = copy.copy(self)
+        other._tiny = tiny
+        return other
+
     def encode(self, clip: Float[Tensor, "t 3 h w"]) -> Float[Tensor, "1 lt c lh lw"]:
         """Scaled latents (float32) of a clip in 0..1, differentiable.
 
@@ -119,6 +138,8 @@ class VideoPrior:
         step = self._space * self.transformer.config.patch_size
         if height % step or width % step:
             raise ValueError(f"height and width of a clip must be multiples of {step} for this prior, found {height}x{width}")
+        if self._tiny is not None:
+            return self._tiny.encode(clip)
         video = (2 * clip - 1).to(self.device, self.dtype).transpose(0, 1)[None]
         return self.vae.encode(video).latent_dist.mode().float().transpose(1, 2) * self.vae.config.scaling_factor
 
@@ -171,7 +192,7 @@ class VideoPrior:
         _, latent_frames, _, height, width = shape
         frames = (latent_frames - 1) * embed.temporal_compression_ratio + 1
         if (embed.sample_frames, embed.sample_height, embed.sample_width) != (frames, height, width):
-            embed.pos_embedding = embed._get_positional_embeddings(height, width, frames).to(self.device)
+            embed.pos_embedding = embed._get_positional_embeddings(height, width, frames).to(self.device, self.dtype)
             embed.sample_frames, embed.sample_height, embed.sample_width = frames, height, width
 
     def _rotary_embedding(self, shape: Sequence[int]) -> Any:

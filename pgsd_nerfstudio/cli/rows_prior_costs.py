@@ -1,0 +1,136 @@
+"""What a guidance step with CogVideoX-2B holds in memory: counted from its architecture, measured where there is a CUDA device.
+
+Neither needs the model's weights: only shapes and number formats decide, and diffusers' defaults are the 2B's configuration
+(Yang et al., "CogVideoX", 2024; its number of parameters is checked). The count leaves out the workspace of kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from pgsd_nerfstudio.cli.records import Record
+from pgsd_nerfstudio.guidance import VideoPrior
+from pgsd_nerfstudio.guidance.memory import MemoryMeter, weights
+from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
+
+FRAMES, HEIGHT, WIDTH = 9, 480, 720
+TEXT = (2, 226, 4096)
+GB = 1e9
+TARGET = "<= 20"
+STEP = f"CogVideoX-2B in fp16, {FRAMES} frames of {WIDTH}x{HEIGHT}"
+COUNTED = "counted on fake tensors, encoder forward, guidance pair, encoder backward; without kernels' workspace"
+
+
+class Count(NamedTuple):
+    """Bytes of one guidance step."""
+
+    weights: int
+    peak: int
+    phases: dict[str, int]
+    """Peak of each: look, pair, encode, backward."""
+
+
+def rows(quick: bool) -> Iterable[Record]:
+    """Memory of one guidance step; `quick` leaves out the arrangements that are not in use."""
+    with FakeTensorMode():
+        parameters = sum(p.numel() for p in random_2b("cpu").transformer.parameters())
+    yield Record.judged("parameters of the counted transformer", round(parameters / 1e9, 3), "billion", "== 1.694", source=STEP)
+    thrifty = counted()
+    yield Record.judged(f"peak of a guidance step, {STEP}", thrifty.peak / GB, "GB", TARGET, source=COUNTED)
+    yield Record("of that, weights of transformer and VAE", thrifty.weights / GB, "GB", source=COUNTED)
+    yield Record("of that, activations of the VAE's backward pass", (thrifty.peak - thrifty.weights) / GB, "GB", source=COUNTED)
+    yield Record("held while the guidance pair is evaluated", thrifty.phases["pair"] / GB, "GB", source=COUNTED)
+    if not quick:
+        yield Record("the same peak, encoder run twice around the pair", counted(twice=True).peak / GB, "GB", source=COUNTED)
+        kept = f"{COUNTED}; checkpointing off"
+        yield Record("the same peak without checkpointing", counted(checkpointing=False).peak / GB, "GB", source=kept)
+        both = counted(checkpointing=False, twice=True).peak / GB
+        yield Record("the same without checkpointing, encoder run twice", both, "GB", source=kept)
+        tiny = f"{COUNTED}; the gradient passes the small encoder taecvx, the VAE's weights stay loaded"
+        yield Record("the same peak through taecvx", counted(tiny=True).peak / GB, "GB", source=tiny)
+    yield measured(thrifty)
+
+
+def random_2b(device: str, *, checkpointing: bool = True) -> VideoPrior:
+    """CogVideoX-2B with random weights in float16; under FakeTensorMode it needs no memory."""
+    from diffusers.models.autoencoders.autoencoder_kl_cogvideox import AutoencoderKLCogVideoX
+    from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
+    from diffusers.schedulers.scheduling_ddim_cogvideox import CogVideoXDDIMScheduler
+
+    scheduler = CogVideoXDDIMScheduler(prediction_type="v_prediction", rescale_betas_zero_snr=True)
+    with torch.device(device), _default_dtype(torch.float16):
+        transformer = CogVideoXTransformer3DModel(sample_frames=FRAMES).eval().requires_grad_(False)
+        vae = AutoencoderKLCogVideoX().eval().requires_grad_(False)
+    if checkpointing:
+        vae.enable_gradient_checkpointing()
+    return VideoPrior(Path("CogVideoX-2B with random weights"), transformer, vae, scheduler)
+
+
+def counted(*, checkpointing: bool = True, twice: bool = False, tiny: bool = False) -> Count:
+    """Count a guidance step of CogVideoX-2B.
+
+    Args:
+        checkpointing: recompute the encoder's activations in the backward pass.
+        twice: encode without a graph, evaluate the guidance pair, then encode again for the gradient.
+        tiny: let the gradient pass the small encoder.
+    """
+    with FakeTensorMode():
+        prior = random_2b("cpu", checkpointing=checkpointing)
+        models = [prior.transformer, prior.vae]
+        if tiny:
+            with _default_dtype(torch.float16):
+                models.append(TinyEncoder())
+            prior = prior.through(models[-1])
+        with MemoryMeter() as meter:
+            held = meter.hold(weights(*models))
+            guidance_step(prior, meter, twice=twice)
+    return Count(held, meter.peak, meter.phases)
+
+
+def guidance_step(prior: VideoPrior, meter: MemoryMeter, *, twice: bool = False) -> None:
+    """What `distill_clip` holds, without the arithmetic on latents, which needs values and no memory to speak of."""
+    pixels = torch.rand(FRAMES, 3, HEIGHT, WIDTH, device=prior.device).requires_grad_()
+    text = torch.zeros(TEXT, dtype=prior.dtype, device=prior.device)
+    with meter.phase("look" if twice else "encode"), torch.set_grad_enabled(not twice):
+        latents = prior.encode(pixels)
+    with meter.phase("pair"):
+        v_negative, v_text = prior.predict_v(latents.detach(), 500, text).split(1)
+        gradient = v_negative + 100.0 * (v_text - v_negative)
+    if twice:
+        with meter.phase("encode"):
+            latents = prior.encode(pixels)
+    with meter.phase("backward"):
+        torch.autograd.grad(latents, pixels, gradient)
+
+
+def measured(count: Count) -> Record:
+    """The peak of PyTorch's allocator in such a step with random weights, beside the count."""
+    name = "the same peak, measured on CUDA"
+    if not torch.cuda.is_available():
+        return Record(name, None, "GB", target=TARGET, source="no CUDA device here; the counted peak stands above")
+    before = torch.cuda.memory_allocated()
+    try:
+        prior = random_2b("cuda")
+        torch.cuda.reset_peak_memory_stats()
+        guidance_step(prior, MemoryMeter())
+    except torch.cuda.OutOfMemoryError as error:
+        return Record(name, None, "GB", target=TARGET, holds=False, source=f"out of memory: {str(error).splitlines()[0]}")
+    peak = torch.cuda.max_memory_allocated() - before
+    source = "torch.cuda.max_memory_allocated, random weights; the error is the count's, relative to it"
+    return Record.judged(name, peak / GB, "GB", TARGET, error=abs(count.peak / peak - 1), error_unit="", source=source)
+
+
+@contextmanager
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(usual)
