@@ -1,6 +1,7 @@
 """The frozen scene's answer: nothing before it comes, nothing of the scene itself changed, every part where it belongs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,11 +13,13 @@ from pgsd_nerfstudio.response.answer import Answer, baked
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
+from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.response.layers import Layers
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import effect
+from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 from pgsd_nerfstudio.weather.effect import EFFECTS, Effect
 from pgsd_nerfstudio.weather.spell import Spell
 
@@ -171,3 +174,18 @@ def test_baked_gaussians_look_like_the_moment_without_air():
     stored = CpuRasterizer(baked(shown, floor())).render(camera()).rgb[0]
     assert (direct - stored).abs().mean() < 0.01
     assert baked(None, floor()).colors.equal(floor().colors)
+
+
+def test_landed_particles_take_the_light_of_their_place():
+    n = GRID**2
+    exposure = answer(effect("snowfall")).exposure
+    half = torch.where(UNIT * floor().means[:, 0] < 0, 0.1, 1.0)  # one side of the floor sees hardly any sky
+    shaded = replace(answer(effect("snowfall")), exposure=replace(exposure, sky=half))
+    look = ParticleLook(torch.ones(3), torch.ones(3, 3), torch.full((3, 3), 0.9))
+    places = torch.tensor([[-1.5, 0.0, 0], [1.5, 0.0, 0], [-1.5, 0.5, 0]])
+    history = SimpleNamespace(collided=torch.tensor([True, True, False]), rest_positions=places)
+    found = in_place(InitialLook(look, look, 0.0), history, shaded, UNIT * floor().means).collided.rgb
+    assert len(half) == n and (found[0] < 0.85).all() and found[0, 2] > found[0, 0]
+    assert torch.allclose(found[1], look.rgb[1], atol=1e-5) and torch.equal(found[2], look.rgb[2])
+    bare = replace(shaded, effect=replace(effect("snowfall"), ambience=None))
+    assert torch.equal(in_place(InitialLook(look, look, 0.0), history, bare, UNIT * floor().means).collided.rgb, look.rgb)

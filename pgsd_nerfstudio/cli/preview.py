@@ -137,6 +137,7 @@ class Preview(Knobs, Simulated):
         from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
         from pgsd_nerfstudio.physics import MAX_PARTICLES, Clock, motion_prior
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+        from pgsd_nerfstudio.response.landed import in_place
         from pgsd_nerfstudio.response.prepare import answer_of, edits_of
         from pgsd_nerfstudio.surface.mesh import surface_of
         from pgsd_nerfstudio.weather import initial_look
@@ -153,6 +154,7 @@ class Preview(Knobs, Simulated):
         answer = answer_of(scene, surface, effect, seconds=self.seconds, seed=self.seed, edits=edits).to(device)
         # A field that has learned nothing hands on the simulated motion and the initial look, bit for bit.
         look, field = initial_look(effect, history, seed=self.seed), DynamicsField.for_history(history)
+        look = in_place(look, history, answer, scene.frame.to_metric(scene.gaussians.means))
         rollout = Rollout(history, look, field, exposure=effect.appearance.exposure)
         cameras = cameras.to(device)
 

@@ -30,7 +30,10 @@ COUNTED = "counted on fake tensors, encoder forward, guidance pair, encoder back
 class Count(NamedTuple):
     """Bytes of one guidance step."""
 
+    parameters: int
+    """Of the transformer; a number, not bytes."""
     weights: int
+    """Of transformer and VAE (and small encoder)."""
     peak: int
     phases: dict[str, int]
     """Peak of each: look, pair, encode, backward."""
@@ -38,10 +41,9 @@ class Count(NamedTuple):
 
 def rows(quick: bool) -> Iterable[Record]:
     """Memory of one guidance step; `quick` leaves out the arrangements that are not in use."""
-    with FakeTensorMode():
-        parameters = sum(p.numel() for p in random_2b("cpu").transformer.parameters())
-    yield Record.judged("parameters of the counted transformer", round(parameters / 1e9, 3), "billion", "== 1.694", source=STEP)
     thrifty = counted()
+    billions = round(thrifty.parameters / 1e9, 3)
+    yield Record.judged("parameters of the counted transformer", billions, "billion", "== 1.694", source=STEP)
     yield Record.judged(f"peak of a guidance step, {STEP}", thrifty.peak / GB, "GB", TARGET, source=COUNTED)
     yield Record("of that, weights of transformer and VAE", thrifty.weights / GB, "GB", source=COUNTED)
     yield Record("of that, activations of the VAE's backward pass", (thrifty.peak - thrifty.weights) / GB, "GB", source=COUNTED)
@@ -82,15 +84,16 @@ def counted(*, checkpointing: bool = True, twice: bool = False, tiny: bool = Fal
     """
     with FakeTensorMode():
         prior = random_2b("cpu", checkpointing=checkpointing)
-        models = [prior.transformer, prior.vae]
-        if tiny:
-            with _default_dtype(torch.float16):
-                models.append(TinyEncoder())
-            prior = prior.through(models[-1])
         with MemoryMeter() as meter:
-            held = meter.hold(weights(*models))
+            held = meter.hold(weights(prior.transformer, prior.vae))
+            if tiny:
+                with _default_dtype(prior.dtype):
+                    encoder = TinyEncoder()
+                held += meter.hold(weights(encoder))
+                prior = prior.through(encoder)
             guidance_step(prior, meter, twice=twice)
-    return Count(held, meter.peak, meter.phases)
+    parameters = sum(p.numel() for p in prior.transformer.parameters())
+    return Count(parameters, held, meter.peak, meter.phases)
 
 
 def guidance_step(prior: VideoPrior, meter: MemoryMeter, *, twice: bool = False) -> None:

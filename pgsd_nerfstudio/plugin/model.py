@@ -32,6 +32,7 @@ from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.response.answer import Answer, Shown, baked
+from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import initial_look
@@ -65,6 +66,7 @@ class WeatherModel(SplatfactoModel):
         Model.populate_modules(self)  # not splatfacto's, which needs CUDA and downloads weights
         options = self.config.options
         look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
+        look = in_place(look, self.history, self.answer, self.stage.scene.frame.to_metric(self.stage.scene.gaussians.means))
         self.field = DynamicsField.for_history(self.history)
         self.look = LearnedLook().to(self.history.device)
         exposure = options.chosen_effect().appearance.exposure

@@ -19,7 +19,7 @@ from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.layers import Layers
-from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, wetted
+from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, under_sky, wetted
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather.ambience import Ambience
 from pgsd_nerfstudio.weather.effect import Effect
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 FAR = 3000.0  # m: where the sky begins, as far as haze is concerned
 OPAQUE_UNDER = 1.5  # a full layer is as opaque as this many more Gaussians in the same place
 WIDER_UNDER = 0.25  # and by so much wider, to close the gaps between blades and stones
-SHELTERED_LIGHT = (0.42, 0.46, 0.55)  # linear light on a layer where no sky is seen, bluish, from all that is bright around
 BLUE_SHADOWS = 0.45  # exponent of the softening with which shadows lose colour
 MIDDLE = 0.18  # linear light of a middle grey
 RELIEF = 0.22  # share of a layer's light that follows the light of what it lies on: its folds are not filled at once
@@ -173,14 +172,9 @@ class Shown:
 
     def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
         """Light of the layer on Gaussians."""
-        sky = self.answer.exposure.sky[ids, None].to(under).sqrt()  # a bright surrounding fills in
-        sheltered = torch.tensor(SHELTERED_LIGHT).to(under)
         relief = 1 - RELIEF + RELIEF * (luminance(under)[:, None] / MIDDLE).clamp_max(1.5)
-        return (
-            linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
-            * relief
-            * torch.lerp(sheltered, torch.ones_like(sheltered), sky)
-        )
+        own = linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
+        return own * relief * under_sky(self.answer.exposure.sky[ids].to(under))
 
     def _in_weather(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], ambience: Ambience) -> Float[Tensor, "m 3"]:
         share = self.share

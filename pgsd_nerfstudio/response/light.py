@@ -17,6 +17,7 @@ WATER = 1.33  # index of refraction
 DRY_ASYMMETRY, WET_ASYMMETRY = 0.80, 0.92
 """Of grains in air and in water. Twomey et al. take up to 0.97 for grains with water all around; surfaces soak less."""
 LEAST_GREEN, MOST_GREEN = 0.05, 0.25  # excess of green of linear light, from grey stone with moss to leaves
+SHELTERED = (0.42, 0.46, 0.55)  # linear light where no sky is seen, bluish, from all that is bright around
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -73,3 +74,9 @@ def mirrored(cosine: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     across = (outside - WATER * inside) / (outside + WATER * inside)
     along = (inside - WATER * outside) / (inside + WATER * outside)
     return 0.5 * (across**2 + along**2)
+
+
+def under_sky(sky: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+    """Light on matter that is white by itself, by the share of the overcast sky that it sees; 1 in the open."""
+    open_share = sky.clamp(0, 1).sqrt()[:, None]  # a bright surrounding fills in
+    return torch.lerp(torch.tensor(SHELTERED).to(sky), torch.ones(3).to(sky), open_share)
