@@ -9,7 +9,7 @@ from dynamics_particles import falling, rollout
 
 from pgsd_nerfstudio.dynamics import RegularizationWeights, drift, regularization
 from pgsd_nerfstudio.dynamics.look import OPACITY_UNIT
-from pgsd_nerfstudio.dynamics.regularizers import rotation_angle, safe_norm
+from pgsd_nerfstudio.dynamics.regularizers import APPEARANCE, rotation_angle, safe_norm
 
 
 def quaternions(count: int) -> torch.Tensor:
@@ -116,3 +116,41 @@ def test_drift_is_zero_untrained_and_the_mean_distance_otherwise():
             x = roll.gaussians(frame).means[: len(active)]
             means.append(float((x - history.positions_at(frame, active)).norm(dim=1).mean()))
     assert drift(roll.frames()) == pytest.approx(sum(means) / len(means), rel=1e-4)
+
+
+ONES = {name: torch.ones(()) for name in ("xyz", "vel", "rot", *APPEARANCE, "look")}
+
+
+@pytest.mark.parametrize("name", list(ONES))
+def test_a_term_left_out_takes_its_weight_from_the_sum(name):
+    full, less = RegularizationWeights(), RegularizationWeights(without=(name,))
+    assert float(full.total(ONES) - less.total(ONES)) == pytest.approx(getattr(full, name), abs=2e-5)
+    assert set(less.weighted(ONES)) == set(ONES) - {name}
+    # What is left out may be anything: it is not multiplied by zero.
+    assert math.isfinite(float(less.total({**ONES, name: torch.tensor(math.nan)})))
+
+
+def test_without_app_leaves_motion_and_look():
+    weights = RegularizationWeights(without=("app",))
+    assert set(weights.weighted(ONES)) == {"xyz", "vel", "rot", "look"}
+    assert float(weights.total(ONES)) == pytest.approx(0.31)
+
+
+@pytest.mark.parametrize("times", [0.1, 10.0])
+def test_the_factor_multiplies_every_term(times):
+    full, scaled = RegularizationWeights(), RegularizationWeights(times=times)
+    assert float(scaled.total(ONES, 3.0)) == pytest.approx(times * float(full.total(ONES, 3.0)), rel=1e-6)
+    for name, value in scaled.weighted(ONES, 3.0).items():
+        assert float(value) == pytest.approx(3.0 * times * getattr(full, name), rel=1e-6)
+
+
+def test_nothing_left_is_a_sum_of_zero():
+    assert float(RegularizationWeights(times=0.0).total(ONES)) == 0.0
+    assert float(RegularizationWeights(without=("app", "xyz", "vel", "rot", "look")).total(ONES)) == 0.0
+
+
+def test_terms_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match=r"must be among xyz, .*look, app; found position"):
+        RegularizationWeights(without=("xyz", "position"))
+    with pytest.raises(ValueError, match="must not be negative, got -1"):
+        RegularizationWeights(times=-1.0)

@@ -1,6 +1,7 @@
 """Score distillation against the textbook expression, against autograd, and against a prior whose score is known exactly."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -67,7 +68,7 @@ def test_the_two_omegas_differ_by_the_known_ratio(timestep, ratio):
 
 def test_last_timestep_is_pure_noise_and_finite():
     for omega, empty in (("sds", True), ("paper_code", False)):
-        config = DistillationConfig(omega=omega)
+        config = DistillationConfig(omega=omega)  # type: ignore[arg-type]
         found = distill(Prior(mean=0.4), torch.randn(SHAPE), TEXT, NEGATIVE, 999, config=config, generator=seeded())
         assert torch.isfinite(found.gradient).all() and (found.loss == 0.0) == empty
 
@@ -105,6 +106,50 @@ def test_gradient_is_bounded_and_keeps_its_direction():
 def test_nan_names_the_timestep():
     with pytest.raises(FloatingPointError, match="at timestep 321 has 360 NaN or infinite values"):
         distill(Prior(mean=math.nan), torch.randn(SHAPE), TEXT, NEGATIVE, 321, config=DistillationConfig(), generator=seeded())
+
+
+class HalfPrior:
+    """Predictions as a model in half precision gives them, up to 1000 in size and opposite for the two texts."""
+
+    def __init__(self, worst: float = 1e3):
+        self.alphas_cumprod, self.worst = scheduler_2b().alphas_cumprod, worst
+
+    def predict_v(self, noisy, timestep, text_embeddings):
+        v = torch.linspace(-1e3, 1e3, noisy[:1].numel()).reshape(SHAPE)
+        v[..., 0] = self.worst
+        return torch.cat([-v, v]).half()
+
+
+@pytest.mark.parametrize("omega", ["sds", "paper_code"])
+def test_a_guidance_scale_of_100_does_not_overflow_half_precision(omega):
+    """100 * 2000 lies beyond 65504, the largest number of float16."""
+    prior, latents, timestep = HalfPrior(), torch.randn(SHAPE, generator=seeded(1)), 300
+    config = DistillationConfig(omega=omega, max_rms=math.inf)
+    found = distill(prior, latents, TEXT, NEGATIVE, timestep, config=config, generator=seeded())
+    eps, eps_hat, x0, x0_hat, weight = explicit(prior, latents, timestep, 100.0, seed=0)
+    truth = weight * (eps_hat - eps if omega == "sds" else x0 - x0_hat)
+    assert found.gradient.dtype == torch.float32
+    assert float((found.gradient - truth).norm() / truth.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("worst", [math.inf, math.nan])
+def test_an_overflow_within_the_prior_is_no_gradient(worst):
+    with pytest.raises(FloatingPointError, match="at timestep 300 has 60 NaN or infinite values"):
+        distill(HalfPrior(worst), torch.randn(SHAPE), TEXT, NEGATIVE, 300, config=DistillationConfig(), generator=seeded())
+
+
+def test_infinity_is_found_even_where_its_weight_is_zero():
+    """At t = 999 the weight of sds is 0."""
+    with pytest.raises(FloatingPointError, match="at timestep 999"):
+        distill(HalfPrior(math.inf), torch.randn(SHAPE), TEXT, NEGATIVE, 999, config=DistillationConfig(), generator=seeded())
+
+
+def test_two_embeddings_are_a_mapping_of_two_roles():
+    latents, config = torch.randn(SHAPE), DistillationConfig()
+    two = distill(Prior(0.4), latents, TEXT, NEGATIVE, 300, config=config, generator=seeded())
+    by_role: Any = {"negative": NEGATIVE, "text": TEXT}
+    one = distill(Prior(0.4), latents, by_role, None, 300, config=config, generator=seeded())
+    assert torch.equal(two.gradient, one.gradient) and two.loss == one.loss
 
 
 def test_same_seed_same_gradient():
@@ -150,10 +195,26 @@ def test_gradient_on_the_clip_is_autograd_of_the_explicit_expression(tmp_path):
     on_latents = distill(prior, latents, text, negative, 400, config=config, generator=seeded(6), frames=9)
     assert found.loss == pytest.approx(on_latents.loss) and found.loss > 0
     (linear,) = torch.autograd.grad((on_latents.gradient * latents).sum(), pixels, retain_graph=True)
-    (quadratic,) = torch.autograd.grad(0.5 * (latents - (latents - on_latents.gradient).detach()).square().sum(), pixels)
+    rest = latents - (latents - on_latents.gradient).detach()
+    (quadratic,) = torch.autograd.grad(0.5 * rest.square().sum(), pixels, retain_graph=True)
+    explicit_loss = (_noise_difference(prior, latents, text, negative, 400, seed=6).detach() * latents).sum()
+    (textbook,) = torch.autograd.grad(explicit_loss, pixels, retain_graph=True)
+    free = distill_clip(prior, clip, text, negative, 400, config=DistillationConfig(max_rms=math.inf), generator=seeded(6))
+    assert float((free.gradient - textbook).norm() / textbook.norm()) < 1e-4
     for truth in (linear, quadratic):
         assert float((found.gradient - truth).norm() / truth.norm()) < 1e-4
     assert clip.grad is None and found.gradient.shape == clip.shape
+
+
+def _noise_difference(prior, latents, text, negative, timestep, seed):
+    """w(t) (eps_hat - eps) in float64, with the noise from v by way of x0_hat and a division."""
+    ab, x0 = prior.alphas_cumprod[timestep], latents.detach().double()
+    a, s = ab.sqrt(), (1 - ab).sqrt()
+    eps = torch.randn(x0.shape, generator=seeded(seed)).double()
+    x_t = a * x0 + s * eps
+    v = prior.predict_v(x_t.float(), timestep, torch.cat([negative, text])).double()
+    e_negative, e_text = ((x_t - a * (a * x_t - s * v)) / s).split(1)
+    return (1 - ab) * (e_negative + 100.0 * (e_text - e_negative) - eps)
 
 
 def test_a_bound_that_is_none_is_refused():

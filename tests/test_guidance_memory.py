@@ -1,6 +1,7 @@
 """The count of bytes against sums done by hand, and against what PyTorch's profiler saw the CPU's allocator do."""
 
 import gc
+from typing import Any
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from guidance_tiny import tiny_pipeline
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.checkpoint import checkpoint
 
+from pgsd_nerfstudio.cli.rows_prior_costs import rows
 from pgsd_nerfstudio.guidance.memory import MemoryMeter, weights
 
 N = 1000
@@ -67,11 +69,12 @@ def test_checkpointing_keeps_the_input_and_recomputes_one_segment_at_a_time():
             torch.autograd.grad(y.sum(), x)
         return after // BYTES, meter.peak // BYTES
 
-    # 12 saved results. The backward pass adds the gradient that comes in (a view of a number) and the one it makes.
-    assert peaks(segment) == (12, 13)
-    # The ends of 4 segments; the last of these is alive too while its own 3 results are made again beside 1 gradient.
-    after, peak = peaks(lambda x: checkpoint(segment, x, use_reentrant=False))
-    assert after == 4 and 4 + 3 <= peak <= 4 + 3 + 2
+    # 12 results are saved, the last of them also has a name here and outlives its node: at the second node two gradients
+    # stand beside all 12.
+    assert peaks(segment) == (12, 14)
+    # The ends of 4 segments. The last segment's 3 results are made again; its first node adds a gradient, its second another
+    # where the first result is gone.
+    assert peaks(lambda x: checkpoint(segment, x, use_reentrant=False)) == (4, 4 + 3 + 1)
 
 
 def test_phases_keep_their_own_peaks():
@@ -91,29 +94,32 @@ def allocator_peak(step):
     gc.collect()
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
         step()
-    events = profile.profiler.kineto_results.events()
-    sizes = [e.nbytes() for e in sorted((e for e in events if e.name() == "[memory]"), key=lambda e: e.start_ns())]
+    assert profile.profiler is not None and profile.profiler.kineto_results is not None
+    events: list[Any] = [e for e in profile.profiler.kineto_results.events() if e.name() == "[memory]"]
+    sizes = [e.nbytes() for e in sorted(events, key=lambda e: e.start_ns())]
     assert sizes
     return max(torch.tensor(sizes).cumsum(0).tolist())
 
 
 @pytest.mark.parametrize("checkpointed", [False, True])
 def test_count_is_what_the_allocator_gave_out(checkpointed):
-    layers = torch.nn.ModuleList(torch.nn.Sequential(torch.nn.Linear(64, 256), torch.nn.GELU(), torch.nn.Linear(256, 64)) for _ in range(6))
-    layers.requires_grad_(False)
+    layers = [torch.nn.Sequential(torch.nn.Linear(64, 256), torch.nn.GELU(), torch.nn.Linear(256, 64)) for _ in range(6)]
+    for layer in layers:
+        layer.requires_grad_(False)
     x = torch.rand(512, 64, requires_grad=True)
 
     def step():
         y = x
         for layer in layers:
-            y = checkpoint(layer, y, use_reentrant=False) if checkpointed else layer(y)
+            # Without keeping the state of the random generator, whose 5 kB a segment are made outside of any operator.
+            y = checkpoint(layer, y, use_reentrant=False, preserve_rng_state=False) if checkpointed else layer(y)
         torch.autograd.grad(y.square().sum(), x)
 
     step()
     truth = allocator_peak(step)
     with MemoryMeter() as meter:
         step()
-    assert meter.peak == pytest.approx(truth, rel=0.01)
+    assert meter.peak == pytest.approx(truth, rel=1e-4)
 
 
 @pytest.mark.parametrize("checkpointed", [False, True])
@@ -132,3 +138,17 @@ def test_fake_tensors_count_as_real_ones_do(checkpointed):
     real = count()
     with FakeTensorMode():
         assert count() == real
+
+
+def test_a_guidance_step_of_cogvideox_2b_fits_a_card_of_24_gb_with_room_to_spare():
+    """Weights by hand: two bytes for each of the published 1.694 + 0.216 billion parameters, and positions in float64."""
+    found = {row.name: row for row in rows(quick=True)}
+    figures = {name: row.value for name, row in found.items() if row.value is not None}
+    transformer, vae, positions = 1_693_783_872, 215_583_907, (226 + 3 * 30 * 45) * 1920
+    held = figures["of that, weights of transformer and VAE"]
+    assert held == pytest.approx((2 * (transformer + vae) + 8 * positions) / 1e9, rel=1e-9)
+    (peak,) = (value for name, value in figures.items() if name.startswith("peak of a guidance step"))
+    assert held < figures["held while the guidance pair is evaluated"] < peak <= 20
+    # One resnet of the first stage, recomputed: two norms, two activations, two convolutions of 128 channels for every pixel.
+    assert peak - held > 6 * 2 * 128 * 9 * 480 * 720 / 1e9
+    assert all(row.holds is not False for row in found.values())

@@ -9,6 +9,7 @@ import torch
 from guidance_tiny import scheduler_2b, tiny_pipeline, write_tiny
 
 from pgsd_nerfstudio.guidance import PriorError, VideoPrior, folder
+from pgsd_nerfstudio.guidance.memory import MemoryMeter
 from pgsd_nerfstudio.guidance.text import token_ids
 
 PROMPT, NEGATIVE = "snow is falling in a garden", "no snow"
@@ -64,7 +65,7 @@ def test_prediction_is_that_of_diffusers_pipeline(tmp_path, monkeypatch, variant
         frames,
         2,
         guidance_scale=6.0,
-        latents=noisy,
+        latents=noisy,  # type: ignore[arg-type]
         output_type="latent",
         max_sequence_length=12,
     )
@@ -89,6 +90,14 @@ def test_positions_are_made_once_per_clip_shape(prior, monkeypatch):
     assert torch.equal(prior.predict_v(noisy, 300, text), first)
 
 
+def test_positions_are_held_in_half_precision_and_are_those_that_diffusers_makes_in_every_call(tiny):
+    held, made = (VideoPrior.load(tiny, dtype=torch.float16) for _ in range(2))
+    text, noisy = held.encode_prompt([PROMPT]), torch.randn(1, 5, 4, 8, 6, generator=torch.Generator().manual_seed(3)).half()
+    truth = made.transformer(noisy, text, torch.tensor([300]), return_dict=False)[0]
+    assert torch.equal(held.predict_v(noisy, 300, text), truth.float())
+    assert held.transformer.patch_embed.pos_embedding.dtype == torch.float16
+
+
 def test_clip_shape_is_the_models_own_or_as_many_frames_as_asked(tiny, prior):
     assert prior.clip_shape == (9, 32, 48)
     assert VideoPrior.load(tiny, frames=17).clip_shape == (17, 32, 48)
@@ -110,12 +119,32 @@ def test_latents_are_the_scaled_mean_of_the_vae_and_differentiable(prior):
 def test_checkpointing_changes_memory_not_gradients(tiny, prior):
     clip = torch.rand(9, 3, 32, 48)
     thrifty = VideoPrior.load(tiny, checkpointing=True)
-    assert thrifty.vae.encoder.gradient_checkpointing and not prior.vae.encoder.gradient_checkpointing
-    gradients = []
+    gradients, kept = [], []
     for which in (prior, thrifty):
         pixels = clip.clone().requires_grad_()
-        gradients += torch.autograd.grad(which.encode(pixels).square().sum(), pixels)
-    torch.testing.assert_close(gradients[0], gradients[1])
+        with MemoryMeter() as meter:
+            latents = which.encode(pixels)
+        kept.append(meter.live)
+        gradients += torch.autograd.grad(latents.square().sum(), pixels)
+    assert torch.equal(gradients[0], gradients[1])
+    assert kept[1] < 0.5 * kept[0]
+
+
+@pytest.mark.parametrize(("checkpointing", "times"), [(False, 1), (True, 2)])
+def test_checkpointing_computes_every_resnet_a_second_time_and_not_a_third(tiny, checkpointing, times):
+    prior = VideoPrior.load(tiny, checkpointing=checkpointing)
+    calls = {}
+    for name, module in prior.vae.encoder.named_modules():
+        if type(module).__name__ == "CogVideoXResnetBlock3D":
+            calls[name] = 0
+
+            def count(*_, name=name):
+                calls[name] += 1
+
+            module.register_forward_pre_hook(count)
+    pixels = torch.rand(9, 3, 32, 48).requires_grad_()
+    torch.autograd.grad(prior.encode(pixels).sum(), pixels)
+    assert calls and set(calls.values()) == {times}
 
 
 def test_no_weight_ever_gets_a_gradient(prior):

@@ -1,4 +1,4 @@
-"""What a guidance step with CogVideoX-2B holds in memory: counted from its architecture, measured where there is a CUDA device.
+"""What a guidance step with CogVideoX-2B holds in memory and computes: counted from its architecture, and measured on CUDA.
 
 Neither needs the model's weights: only shapes and number formats decide, and diffusers' defaults are the 2B's configuration
 (Yang et al., "CogVideoX", 2024; its number of parameters is checked). The count leaves out the workspace of kernels.
@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils.flop_counter import FlopCounterMode
 
 from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.guidance import VideoPrior
 from pgsd_nerfstudio.guidance.memory import MemoryMeter, weights
+from pgsd_nerfstudio.guidance.prior import recompute_resnets
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
 
 FRAMES, HEIGHT, WIDTH = 9, 480, 720
@@ -25,6 +28,28 @@ GB = 1e9
 TARGET = "<= 20"
 STEP = f"CogVideoX-2B in fp16, {FRAMES} frames of {WIDTH}x{HEIGHT}"
 COUNTED = "counted on fake tensors, encoder forward, guidance pair, encoder backward; without kernels' workspace"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arrangement:
+    """How the gradient of one guidance step is carried back to the clip."""
+
+    recomputed: Literal["resnets", "stages too", "nothing"] = "resnets"
+    """What the encoder's backward pass makes again instead of finding it kept; `stages too` is diffusers' own switch."""
+    twice: bool = False
+    """Encode without a graph, evaluate the guidance pair, then encode again for the gradient."""
+    tiny: bool = False
+    """Let the gradient pass the small encoder taecvx; the VAE's weights stay loaded."""
+
+
+USED = Arrangement()
+OTHERS = {
+    "encoder run twice around the pair": Arrangement(twice=True),
+    "whole stages recomputed too": Arrangement(recomputed="stages too"),
+    "nothing recomputed": Arrangement(recomputed="nothing"),
+    "nothing recomputed, encoder twice": Arrangement(recomputed="nothing", twice=True),
+    "through taecvx": Arrangement(tiny=True),
+}
 
 
 class Count(NamedTuple):
@@ -36,30 +61,28 @@ class Count(NamedTuple):
     """Of transformer and VAE (and small encoder)."""
     peak: int
     phases: dict[str, int]
-    """Peak of each: look, pair, encode, backward."""
+    """Peak of each: look, encode, pair, backward."""
 
 
 def rows(quick: bool) -> Iterable[Record]:
-    """Memory of one guidance step; `quick` leaves out the arrangements that are not in use."""
-    thrifty = counted()
-    billions = round(thrifty.parameters / 1e9, 3)
+    """Memory and arithmetic of one guidance step; `quick` leaves out the arithmetic and arrangements that are not in use."""
+    used = counted(USED)
+    billions = round(used.parameters / 1e9, 3)
     yield Record.judged("parameters of the counted transformer", billions, "billion", "== 1.694", source=STEP)
-    yield Record.judged(f"peak of a guidance step, {STEP}", thrifty.peak / GB, "GB", TARGET, source=COUNTED)
-    yield Record("of that, weights of transformer and VAE", thrifty.weights / GB, "GB", source=COUNTED)
-    yield Record("of that, activations of the VAE's backward pass", (thrifty.peak - thrifty.weights) / GB, "GB", source=COUNTED)
-    yield Record("held while the guidance pair is evaluated", thrifty.phases["pair"] / GB, "GB", source=COUNTED)
-    if not quick:
-        yield Record("the same peak, encoder run twice around the pair", counted(twice=True).peak / GB, "GB", source=COUNTED)
-        kept = f"{COUNTED}; checkpointing off"
-        yield Record("the same peak without checkpointing", counted(checkpointing=False).peak / GB, "GB", source=kept)
-        both = counted(checkpointing=False, twice=True).peak / GB
-        yield Record("the same without checkpointing, encoder run twice", both, "GB", source=kept)
-        tiny = f"{COUNTED}; the gradient passes the small encoder taecvx, the VAE's weights stay loaded"
-        yield Record("the same peak through taecvx", counted(tiny=True).peak / GB, "GB", source=tiny)
-    yield measured(thrifty)
+    yield Record.judged(f"peak of a guidance step, {STEP}", used.peak / GB, "GB", TARGET, source=COUNTED)
+    yield Record("of that, weights of transformer and VAE", used.weights / GB, "GB", source=COUNTED)
+    yield Record("of that, activations of the VAE's backward pass", (used.peak - used.weights) / GB, "GB", source=COUNTED)
+    yield Record("held while the guidance pair is evaluated", used.phases["pair"] / GB, "GB", source=COUNTED)
+    yield measured(used)
+    if quick:
+        return
+    yield Record("arithmetic of a guidance step", arithmetic(USED) / 1e12, "TFLOP", source=COUNTED)
+    for how, arrangement in OTHERS.items():
+        yield Record(f"the same peak, {how}", counted(arrangement).peak / GB, "GB", source=COUNTED)
+        yield Record(f"the same arithmetic, {how}", arithmetic(arrangement) / 1e12, "TFLOP", source=COUNTED)
 
 
-def random_2b(device: str, *, checkpointing: bool = True) -> VideoPrior:
+def random_2b(device: str, arrangement: Arrangement = USED) -> VideoPrior:
     """CogVideoX-2B with random weights in float16; under FakeTensorMode it needs no memory."""
     from diffusers.models.autoencoders.autoencoder_kl_cogvideox import AutoencoderKLCogVideoX
     from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
@@ -69,31 +92,44 @@ def random_2b(device: str, *, checkpointing: bool = True) -> VideoPrior:
     with torch.device(device), _default_dtype(torch.float16):
         transformer = CogVideoXTransformer3DModel(sample_frames=FRAMES).eval().requires_grad_(False)
         vae = AutoencoderKLCogVideoX().eval().requires_grad_(False)
-    if checkpointing:
+    if arrangement.recomputed == "resnets":
+        recompute_resnets(vae)
+    elif arrangement.recomputed == "stages too":
         vae.enable_gradient_checkpointing()
     return VideoPrior(Path("CogVideoX-2B with random weights"), transformer, vae, scheduler)
 
 
-def counted(*, checkpointing: bool = True, twice: bool = False, tiny: bool = False) -> Count:
-    """Count a guidance step of CogVideoX-2B.
-
-    Args:
-        checkpointing: recompute the encoder's activations in the backward pass.
-        twice: encode without a graph, evaluate the guidance pair, then encode again for the gradient.
-        tiny: let the gradient pass the small encoder.
-    """
+def counted(arrangement: Arrangement = USED) -> Count:
+    """Bytes of a guidance step of CogVideoX-2B."""
     with FakeTensorMode():
-        prior = random_2b("cpu", checkpointing=checkpointing)
+        prior, models = _arranged(arrangement)
         with MemoryMeter() as meter:
-            held = meter.hold(weights(prior.transformer, prior.vae))
-            if tiny:
-                with _default_dtype(prior.dtype):
-                    encoder = TinyEncoder()
-                held += meter.hold(weights(encoder))
-                prior = prior.through(encoder)
-            guidance_step(prior, meter, twice=twice)
+            held = meter.hold(weights(*models))
+            guidance_step(prior, meter, twice=arrangement.twice)
     parameters = sum(p.numel() for p in prior.transformer.parameters())
     return Count(parameters, held, meter.peak, meter.phases)
+
+
+def arithmetic(arrangement: Arrangement = USED) -> int:
+    """Operations of a guidance step in matrix products and convolutions, two for a multiplication with its addition.
+
+    Not counted beside the bytes: PyTorch's counter of operations ties graphs into reference cycles and so holds tensors that
+    a run would have freed.
+    """
+    with FakeTensorMode(), FlopCounterMode(display=False) as flop:
+        prior, _ = _arranged(arrangement)
+        guidance_step(prior, MemoryMeter(), twice=arrangement.twice)
+    return flop.get_total_flops()
+
+
+def _arranged(arrangement: Arrangement) -> tuple[VideoPrior, list[torch.nn.Module]]:
+    prior = random_2b("cpu", arrangement)
+    models = [prior.transformer, prior.vae]
+    if not arrangement.tiny:
+        return prior, models
+    with _default_dtype(prior.dtype):
+        encoder = TinyEncoder()
+    return prior.through(encoder), [*models, encoder]
 
 
 def guidance_step(prior: VideoPrior, meter: MemoryMeter, *, twice: bool = False) -> None:

@@ -1,17 +1,29 @@
 """LEARNED: the neural dynamics field, rolled out over time from the simulated motion."""
 
-from pgsd_nerfstudio.dynamics.field import DeltaBounds, DynamicsField
+from pgsd_nerfstudio.dynamics.deformation import Deformation, DeformationConfig, DeformedCloud, scattered
+from pgsd_nerfstudio.dynamics.field import DeltaBounds, DynamicsField, FieldConfig
 from pgsd_nerfstudio.dynamics.look import LearnedLook
-from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights, drift, regularization
-from pgsd_nerfstudio.dynamics.rollout import RolledFrame, Rollout
+from pgsd_nerfstudio.dynamics.regularizers import Gap, RegularizationWeights, drift, gap, regularization
+from pgsd_nerfstudio.dynamics.rollout import Begin, Motion, RolledFrame, Rollout
+from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 
 __all__ = [
+    "Begin",
+    "Deformation",
+    "DeformationConfig",
+    "DeformedCloud",
     "DeltaBounds",
     "DynamicsField",
+    "FieldConfig",
+    "Gap",
     "LearnedLook",
+    "Motion",
     "RegularizationWeights",
     "RolledFrame",
     "Rollout",
+    "VelocityField",
     "drift",
+    "gap",
     "regularization",
+    "scattered",
 ]

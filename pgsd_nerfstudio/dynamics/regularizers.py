@@ -127,8 +127,8 @@ class Gap(NamedTuple):
 def gap(rollout: Rollout, windows: Sequence[tuple[int, int]], *, begin: Begin = "simulation") -> Gap:
     """Drift of training clips against that of the roll-out which is shown in the end, at the same frames.
 
-    Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at the
-    roll-out start from kept states: with those of the present weights the gap is zero, else it is what stale ones cost.
+    Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at
+    the roll-out start from kept states: with those of the present weights the gap is zero, else it is what stale ones cost.
 
     Args:
         rollout: its kept states are left as they are.

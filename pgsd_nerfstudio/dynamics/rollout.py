@@ -66,8 +66,8 @@ class Rollout:
         """`stride` frames lie between kept states; all parts must be on one device.
 
         With an `exposure` in seconds the Gaussians in the air carry how far the simulation moves them in that time.
-        `motion`: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or that
-        of the place where it is ("field", see VelocityField); both lead to the simulated contact.
+        `motion`: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or
+        that of the place where it is ("field", see VelocityField); both lead to the simulated contact.
 
         Raises:
             ValueError: the stride is below one frame, or there is no such motion.
@@ -182,7 +182,7 @@ class Rollout:
             state, deltas = advance(state, self.history, look, self.field, visible, self._flow)
             clip.append(self._rendered(state, look, deltas))
         for rolled in clip:
-            _check_finite(rolled)
+            check_finite(rolled)
         return clip
 
     @cached_property
@@ -262,7 +262,8 @@ def _fields(look: ParticleLook) -> tuple[Tensor, Tensor, Tensor]:
     return look.opacity, look.scales, look.rgb
 
 
-def _check_finite(rolled: RolledFrame) -> None:
+def check_finite(rolled: RolledFrame) -> None:
+    """Raises FloatingPointError: a Gaussian is not finite; the message names quantity and frame."""
     try:
         rolled.gaussians.check_finite()
     except ValueError as error:

@@ -4,8 +4,8 @@ The paper's x(t) = x(t-1) + v_sim(t) + dv is carried as the learned offset alone
 same sum, but a field that adds nothing reproduces the simulation bit for bit, however many frames it runs.
 
 A particle that has drifted goes on with the simulated motion of where it is not. With a velocity field V the step gains
-V(x) - V(x_sim): what the simulation does where the particle is rendered instead of where it was simulated. What is its own, such
-as the fall speed of its size, stays with it, and without drift nothing is added.
+V(x) - V(x_sim): what the simulation does where the particle is rendered instead of where it was simulated. What is its own,
+such as the fall speed of its size, stays with it, and without drift nothing is added.
 """
 
 from __future__ import annotations

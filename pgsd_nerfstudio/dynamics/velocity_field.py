@@ -1,9 +1,9 @@
 """The simulated velocity by place and frame, for particles that are no longer where the simulation had them.
 
-The steps of the simulated particles, kept on a coarse grid. A node takes the mean of the particles around it with the weights of
-trilinear interpolation. Reading that back smooths; so the means of what it misses are added a few times (Van Cittert's iteration,
-stable since the weights are not negative and sum to one), which also takes off most of the error of nodes that have particles on
-one side only. Nodes without particles take the value of the nearest node that has some.
+The steps of the simulated particles, kept on a coarse grid. A node takes the mean of the particles around it with the weights
+of trilinear interpolation. Reading that back smooths; so the means of what it misses are added a few times (Van Cittert's
+iteration, stable since the weights are not negative and sum to one), which also takes off most of the error of nodes that have
+particles on one side only. Nodes without particles take the value of the nearest node that has some.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 from pgsd_nerfstudio.physics.history import ParticleHistory
 
 MOST_BYTES = 50e6
-PER_CELL = 8  # particles in the air in a cell, on average: fewer, and the grid keeps their own fall speeds instead of the flow
+PER_CELL = 4  # particles in the air in a cell, on average: fewer, and the grid keeps their own fall speeds instead of the flow
 CORRECTIONS = 3
 
 
@@ -60,7 +60,7 @@ class VelocityField:
 
         Args:
             history: the simulated motion.
-            cell: metres between nodes; None: as fine as 50 MB and eight particles in a cell allow.
+            cell: metres between nodes; None: as fine as 50 MB and four particles in a cell allow.
 
         Raises:
             ValueError: the cell is not a positive length, or would take more than 50 MB.
@@ -76,8 +76,8 @@ class VelocityField:
         nodes, size = math.prod(shape), steps * math.prod(shape) * 3 * like.element_size()
         if size > MOST_BYTES:
             raise ValueError(
-                f"a velocity field must stay below {MOST_BYTES / 1e6:.0f} MB; cells of {cell:.3g} m take {size / 1e6:.0f} MB for "
-                f"{steps} steps, take larger ones"
+                f"a velocity field must stay below {MOST_BYTES / 1e6:.0f} MB; cells of {cell:.3g} m take {size / 1e6:.0f} MB "
+                f"for {steps} steps, take larger ones"
             )
         field = VelocityField(low, cell, shape, like.new_zeros(steps, nodes, 3))
         for frame in range(1, history.frames):
@@ -115,14 +115,11 @@ class VelocityField:
         place = torch.minimum(((position - self.low) / self.cell).clamp_min(0), last.to(position))
         # As integers, so that a position that is not finite reads some node and stays what it is by its weight.
         corner = torch.minimum(place.detach().floor().long().clamp_min(0), last - 1)
-        share = place - corner
-        nodes, weights = [], []
-        for which in range(8):
-            up = torch.tensor([which >> 2 & 1, which >> 1 & 1, which & 1], device=position.device)
-            x, y, z = (corner + up).unbind(1)
-            nodes.append((x * self.shape[1] + y) * self.shape[2] + z)
-            weights.append(torch.where(up.bool(), share, 1 - share).prod(dim=1))
-        return Stencil(torch.stack(nodes, 1), torch.stack(weights, 1))
+        share = (place - corner)[:, None]
+        up = torch.cartesian_prod(*3 * [torch.arange(2, device=position.device)])  # [8, 3]
+        x, y, z = (corner[:, None] + up).unbind(2)
+        along = torch.where(up.bool(), share, 1 - share)
+        return Stencil((x * self.shape[1] + y) * self.shape[2] + z, along[..., 0] * along[..., 1] * along[..., 2])
 
     def _fitted(self, around: Stencil, step: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
         nodes = math.prod(self.shape)

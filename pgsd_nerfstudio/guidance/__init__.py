@@ -3,7 +3,7 @@
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, Distilled, DistilledClip, distill, distill_clip
 from pgsd_nerfstudio.guidance.folder import PriorError
 from pgsd_nerfstudio.guidance.prior import VideoPrior
-from pgsd_nerfstudio.guidance.prompts import Prompts, encode, prompts_for
+from pgsd_nerfstudio.guidance.prompts import Prompts, embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, WeightDecay, Weighting, regularization_scale
 from pgsd_nerfstudio.guidance.variants import Embeddings, Omega, Role, Variant, roles_of
 
@@ -23,7 +23,7 @@ __all__ = [
     "Weighting",
     "distill",
     "distill_clip",
-    "encode",
+    "embed_texts",
     "prompts_for",
     "regularization_scale",
     "roles_of",

@@ -39,28 +39,29 @@ class DistillationConfig:
     """How the predictions of the video prior become a gradient."""
 
     variant: Variant = "sds"
-    """Kind of score distillation: sds as in the paper; nfsd leaves the noise out of the gradient, against over-smoothing (Katzir et
-    al. 2023); bridge first does as sds, then leads from the flawed look this leaves to a clean one, against oversaturation
-    (McAllister et al. 2024). The paper's supplement finds both a little better; nfsd asks the prior three times a step, not twice."""
+    """Kind of score distillation: sds as in the paper; nfsd leaves the noise out of the gradient, against over-smoothing
+    (Katzir et al. 2023); bridge does as sds first, then leads from the flawed look this leaves to a clean one, against
+    oversaturation (McAllister et al. 2024). The paper's supplement finds both a little better; nfsd asks the prior about three
+    texts a step, the others about two."""
     guidance_scale: float = 100.0
-    """Classifier-free guidance s in v_neg + s (v_text - v_neg), of sds and of bridge's first stage; 100 as in the paper. (Its code
-    adds s (v_text - v_neg) to v_text instead: the same with s + 1.)"""
+    """Classifier-free guidance s in v_neg + s (v_text - v_neg), of sds and of bridge's first stage; 100 as in the paper. (Its
+    code adds s (v_text - v_neg) to v_text instead: the same with s + 1.)"""
     omega: Omega = "sds"
-    """Weight of a timestep, which the paper leaves open: sds (1 - alpha_bar)(eps_hat - eps), as in DreamFusion, which fades toward
-    pure noise; uniform 1 (eps_hat - eps); fantasia3d sqrt(alpha_bar)(1 - alpha_bar)(eps_hat - eps), as in Fantasia3D, which fades
-    at both ends; paper_code (1 - alpha_bar)(x0 - x0_hat), as the paper's code has it: 0.24 times that of sds at t = 20, 9 times at
-    740, 202 times at 980."""
+    """Weight of a timestep, which the paper leaves open: sds (1 - alpha_bar)(eps_hat - eps), as in DreamFusion, which fades
+    toward pure noise; uniform 1 (eps_hat - eps); fantasia3d sqrt(alpha_bar)(1 - alpha_bar)(eps_hat - eps), as in Fantasia3D,
+    which fades at both ends; paper_code (1 - alpha_bar)(x0 - x0_hat), as the paper's code has it: 0.24 times that of sds at
+    t = 20, 9 times at 740, 202 times at 980."""
     nfsd_scale: float = 7.5
-    """Guidance s of nfsd in s (eps_text - eps_0); 7.5, the usual scale for sampling, as in its paper: without the noise a hundred
-    is not needed."""
+    """Guidance s of nfsd in s (eps_text - eps_0); 7.5, the usual scale for sampling, as in its paper: without the noise a
+    hundred is not needed."""
     nfsd_threshold: int = 90
     """Timestep t* below which nfsd trusts the prior's prediction for the empty text to be all there is to correct; 90 is where
     CogVideoX-2B has the signal-to-noise ratio of Stable Diffusion at 200, the value of its paper."""
     bridge_scale: float = 30.0
     """Scale s of bridge's second stage in s (eps_target - eps_source); 30 as in its paper's code."""
     bridge_start: float = 0.5
-    """Share of the training steps, 0-1, after which bridge's second stage begins; half of them, as in its paper's code. 0: at once;
-    what stage two starts from should already resemble what is wanted."""
+    """Share of the training steps, 0-1, after which bridge's second stage begins; half of them, as in its paper's code. Below
+    that, stage two starts from what does not yet resemble what is wanted."""
     max_rms: float = 10.0
     """Bound of the gradient's root mean square over the latents; a larger one is scaled down. Latents are of size 1."""
 

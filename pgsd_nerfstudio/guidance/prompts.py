@@ -1,8 +1,8 @@
 """What the video prior is told and asked about, for each kind of score distillation. Texts only; each is encoded once.
 
-The words against flaws are those published with the methods: NFSD's negative text in Katzir et al. (2023), Bridge-SDS's suffixes
-in the code of McAllister et al. (2024). They were written for clear portraits of single things, and some of them name what a
-weather is; those are left out (`BELONGS`), else the prior would be led away from the very thing it is asked for.
+The words against flaws are those published with the methods: NFSD's negative text in Katzir et al. (2023), the suffixes of
+Bridge-SDS in the code of McAllister et al. (2024). They were written for clear portraits of single things, and some of them
+name what a weather is; those are left out (`BELONGS`), else the prior would be led away from the very thing it is asked for.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ BELONGS: dict[str, frozenset[str]] = {
     "rainfall": _VEIL | _OVERCAST | {"dark"},
     # Dust is a dense veil that takes the light and the sharpness of what is behind it; flying grains look like noise.
     "sandstorm": _VEIL | _OVERCAST | {"dark", "blurry", "noisy"},
-    # Flakes all over the picture look like noise, and veil the distance under a grey sky. The ground is bright: dark stays a flaw.
+    # Flakes all over the picture look like noise and veil the distance, under a grey sky. The ground is bright: dark is a flaw.
     "snowfall": _VEIL | _OVERCAST | {"noisy"},
 }
 """Words of the published lists that name what an effect is, hence no flaws of it."""
@@ -101,8 +101,8 @@ def prompts_for(effect: str, prompt: str, negative_prompt: str, description: str
     - snowfall: foggy, hazy, low contrast, dull, gloomy, noisy
     - an effect of another name: all of these, since any of them may be what it is
 
-    and for every effect those that the prompt itself asks for, such as "cartoon snowflakes". The effect's own negative prompt was
-    written for it and stays as it is.
+    and for every effect those that the prompt itself asks for, such as "cartoon snowflakes". The effect's own negative prompt
+    was written for it and stays as it is.
 
     Args:
         effect: name of the effect, such as "snowfall".
@@ -118,7 +118,7 @@ def prompts_for(effect: str, prompt: str, negative_prompt: str, description: str
     return Prompts(text=text, negative=negative_prompt, flaws=flaws, target=target, source=source)
 
 
-def encode(prior: Listener, texts: Mapping[Role, str]) -> dict[Role, Float[Tensor, "1 l d"]]:
+def embed_texts(prior: Listener, texts: Mapping[Role, str]) -> dict[Role, Float[Tensor, "1 l d"]]:
     """Embeddings by role, in one pass of the text encoder; to be kept for the whole training."""
     return dict(zip(texts, prior.encode_prompt(list(texts.values())).split(1), strict=True))
 

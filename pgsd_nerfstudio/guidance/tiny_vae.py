@@ -1,6 +1,6 @@
-"""A small encoder in place of the VAE's: the gradient on a clip for about a hundredth of the arithmetic, and less exact.
+"""A small encoder in place of the VAE's: the gradient on a clip for a fiftieth of the arithmetic, and less exact.
 
-Bohan, TAEHV (2025, https://github.com/madebyollin/taehv, MIT licence): an encoder of 3x3 convolutions, distilled to give the
+Boer Bohan, TAEHV (2025, https://github.com/madebyollin/taehv): an encoder of 3x3 convolutions, distilled to give the
 scaled latents of a large video VAE. Its weights for CogVideoX are called taecvx; download them yourself. Layout, by the names
 of its tensors: three stages that each merge neighbouring frames (2, 2, 1), halve the picture and pass three blocks that see
 their own input of the frame before; pixels in 0..1, no scaling factor. The same shapes serve other video models, so that a

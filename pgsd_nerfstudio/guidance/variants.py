@@ -1,7 +1,7 @@
 """Kinds of score distillation: which texts the video prior is asked about, and how its answers become one direction.
 
 With a = sqrt(alpha_bar), s = sqrt(1 - alpha_bar), x_t = a x0 + s eps and v = a eps - s x0, every prediction of noise is
-eps_hat = s x_t + a v_hat. Differences of predictions are therefore a (v_1 - v_2), and what has to be known is never divided by a:
+eps_hat = s x_t + a v_hat. Differences of predictions are a (v_1 - v_2): alpha_bar = 0 at the last timestep is no trouble.
 
     sds     w [eps_neg + g (eps_text - eps_neg) - eps]       Poole et al., "DreamFusion" (2022), eq. 3
     nfsd    w [g (eps_text - eps_0) + delta_D]               Katzir et al., "Noise-Free Score Distillation" (2023)
@@ -21,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 Role = Literal["text", "negative", "empty", "flaws", "target", "source"]
-"""What a text is for. text: what is wanted; negative: what is not; empty: nothing said; flaws: how bad videos look (nfsd); target
-and source: what is wanted, and the flawed look that stage one leaves (bridge)."""
+"""What a text is for. text: what is wanted; negative: what is not; empty: nothing said; flaws: how bad videos look (nfsd);
+target: what is wanted, in high quality, and source: the same with the flaws that stage one leaves (bridge)."""
 Embeddings = Mapping[Role, Float[Tensor, "1 l d"]]
 Variant = Literal["sds", "nfsd", "bridge"]
 Omega = Literal["sds", "uniform", "fantasia3d", "paper_code"]
@@ -87,7 +87,7 @@ def require_roles(variant: Variant, embeddings: Embeddings) -> None:
 
 
 def rule_at(variant: Variant, timestep: int, threshold: int, progress: float | None, start: float) -> Rule:
-    """What to do at this timestep (nfsd: fine below `threshold`) and this share of the training (bridge: stage two from `start`).
+    """What to do at this timestep (nfsd: fine below `threshold`) and share of the training (bridge: stage two from `start`).
 
     Raises:
         ValueError: bridge has not been told its progress in 0..1, or the variant is unknown.

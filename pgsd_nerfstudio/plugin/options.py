@@ -94,6 +94,8 @@ class WeatherOptions(Knobs, SceneOptions):
     flies, is printed with the first clip; by default exact."""
     refresh_every: int = 50
     """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
+    clip_every: int = 20
+    """Steps between training clips that go to the log as pictures, their frames side by side (--vis tensorboard); 0: never."""
     clip_frames: int | None = None
     """Frames of a training clip; by default 9 as in the paper, or what the video prior was made for if that is less."""
     clip_height: int | None = None

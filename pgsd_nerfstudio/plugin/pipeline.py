@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import psutil
 import torch
 import torchvision
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -33,7 +34,7 @@ from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.summary import print_summary
 
-MAX_SKIPPED = 5  # steps in a row that may pass without a gradient
+MAX_SKIPPED = 2  # steps in a row that may pass without a gradient; one more ends the run
 
 console = Console(stderr=True, highlight=False)
 
@@ -76,7 +77,7 @@ class WeatherPipeline(VanillaPipeline):
             RunError: the motion prior or the video prior cannot be made or found.
         """
         Pipeline.__init__(self)
-        self._skipped = 0
+        self._skipped = self._skipped_in_all = 0
         self._layers_judged = False
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
         self.guide: Guide | None = None
@@ -153,12 +154,17 @@ class WeatherPipeline(VanillaPipeline):
             losses = {name: scale * getattr(weights, name) * value for name, value in terms.items()}
         with torch.no_grad():
             metres = drift(rolled)
+        if options.clip_every and step % options.clip_every == 0:
+            writer.put_image("clip", torch.cat(list(clip), dim=2).permute(1, 2, 0).cpu(), step)
         # The number shown is |L_SDS|, the gradient that of the surrogate.
         losses = {"video": video - video.detach() + distilled.loss, **losses}
         metrics = {
             "sds": distilled.loss,
             "timestep": distilled.timestep,
             "drift_m": metres,
+            "skipped": self._skipped_in_all,
+            "memory_mb": _memory(stage.device),
+            **{f"weight/{name}": scale * getattr(weights, name) for name in terms},
             "particles_seen": int(seen.sum()),
             **{f"gradient/{name}": norm for name, norm in norms.items()},
             **{f"seconds/{name}": seconds for name, seconds in watch.seconds.items()},
@@ -172,6 +178,7 @@ class WeatherPipeline(VanillaPipeline):
             distilled = self.guide.gradient(clip, step)
         except FloatingPointError as error:
             self._skipped += 1
+            self._skipped_in_all += 1
             if self._skipped > MAX_SKIPPED:
                 raise RunError(f"{self._skipped} steps in a row gave nothing: {error}") from error
             console.print(f"[yellow]step {step} gives no gradient: {error}[/]")
@@ -236,3 +243,10 @@ class WeatherPipeline(VanillaPipeline):
         """
         prefix = "_model."
         self._model.load_state_dict({k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)})
+
+
+def _memory(device: torch.device) -> float:
+    """MB: the most that the process has held of a GPU so far, or what it holds of the machine's memory now."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    return psutil.Process().memory_info().rss / 1e6

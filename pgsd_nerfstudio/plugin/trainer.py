@@ -40,6 +40,11 @@ class WeatherTrainer(Trainer):
                 f"Interrupted at step {self.step}; to go on, add to the same command: --load-dir {self.checkpoint_dir}"
             )
             return
+        except RunError:
+            # Nothing of the steps before is lost to what broke this one.
+            self.save_checkpoint(self.step)
+            CONSOLE.print(f"Stopped at step {self.step}; what was learned lies in {self.checkpoint_dir}", soft_wrap=True)
+            raise
         config = self.config.get_base_dir() / "config.yml"
         stage: Any = self.pipeline.model.stage
         CONSOLE.print(f"Frozen scene while training: {stage.clip_rasterizer.memory}", soft_wrap=True)

@@ -1,0 +1,202 @@
+"""Motion without simulation: Gaussians spread over the box and moved by a network of place and time alone.
+
+The paper's ablation "w/o Motion": in place of its 4D Gaussian splatting (Wu et al. 2024, a deformation of canonical Gaussians
+by time) the same backbone and encodings as the field's, so that nothing differs but where motion comes from. No births, no
+landings, no recurrence. A DeformedCloud is used like a Rollout; the terms xyz, vel and rot then hold it to where it was spread,
+and are to be left out (RegularizationWeights.without) for the ablation as published.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import roma
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
+from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
+from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
+from pgsd_nerfstudio.dynamics.rollout import Begin, Progress, RolledFrame, check_finite
+from pgsd_nerfstudio.dynamics.state import Deltas, turned
+from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather.appearance import InitialLook
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeformationConfig:
+    """How far a Gaussian may come from how it was spread."""
+
+    reach: float = 0.5
+    """Largest displacement per axis as a share of the box along it: half the box, so that one can fall through a good part."""
+    rotation: float = math.pi
+    """Largest turn about each axis in radians."""
+
+
+class Deformation(nn.Module):
+    """Network of initial position and time; zero heads, its start, deform nothing. Every output is bounded (bound x tanh)."""
+
+    box: Tensor
+
+    def __init__(self, box: Float[Tensor, "2 3"], frames: int, config: DeformationConfig | None = None) -> None:
+        """`box`: corners of the domain in metres."""
+        super().__init__()
+        self.frames, self.config = frames, config or DeformationConfig()
+        self.register_buffer("box", box.detach().clone().float())
+        self.net = StateNet({"position": 3, "rotation": 3, **LOOK}, 2 * WIDTH)
+
+    def forward(
+        self, position: Float[Tensor, "n 3"], frame: int
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Change]:  # m, rad about the particle's own axes
+        """Displacement, rotation vector and change of look at a frame, of what was spread at `position` (metres)."""
+        out = self.net(fourier(within(self.box, position)), sinusoidal(frame / self.frames, self.box))
+        low, high = self.box
+        change = Change(out["opacity"][:, 0], LOG_SCALE_BOUND * out["scale"], out["rgb"])
+        return self.config.reach * (high - low) * out["position"], self.config.rotation * out["rotation"], change
+
+
+def scattered(box: Float[Tensor, "2 3"], like: ParticleHistory, count: int, *, seed: int = 0) -> ParticleHistory:
+    """`count` particles at random places of `box` (metres), in the air and at rest in all frames; sizes as those of `like`.
+
+    Raises:
+        ValueError: there is nothing to scatter, or no particle to take a size from.
+    """
+    if count < 1 or len(like) < 1:
+        raise ValueError(f"scattering takes at least one particle and one to be like, got {count} like {len(like)}")
+    rng = torch.Generator().manual_seed(seed)
+    low, high = box.to(like.positions)
+    places = low + torch.rand(count, 3, generator=rng).to(like.positions) * (high - low)
+    chosen = torch.randint(len(like), (count,), generator=rng).to(like.device)
+    zeros = torch.zeros(count, dtype=torch.int32, device=like.device)
+    return ParticleHistory(
+        births=zeros,
+        ends=zeros + like.frames,
+        collided=zeros.bool(),
+        offsets=torch.arange(count + 1, device=like.device) * like.frames,
+        positions=places.repeat_interleave(like.frames, dim=0),
+        rest_positions=torch.zeros_like(places),
+        rest_quats=like.quats[chosen],
+        rest_extents=like.rest_extents[chosen],
+        rest_covers=torch.zeros_like(like.rest_covers[chosen]),
+        quats=like.quats[chosen],
+        diameters=like.diameters[chosen],
+        represents=like.represents[chosen],
+        kinds=torch.zeros_like(like.kinds[chosen]),
+        fps=like.fps,
+        frames=like.frames,
+        about={"scattered": count, "seed": seed},
+    )
+
+
+class _Deformed(NamedTuple):
+    """Some particles at one frame."""
+
+    ids: Int[Tensor, "n"]
+    moved: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    change: Change
+
+
+class DeformedCloud:
+    """Scattered Gaussians over time, at random access and in windows with gradient, like a Rollout. Everything is in metres."""
+
+    stale = False
+    """Nothing is kept, so nothing is ever out of date."""
+
+    def __init__(
+        self, history: ParticleHistory, look: InitialLook, deformation: Deformation, learned_look: LearnedLook | None = None
+    ) -> None:
+        """`history` as `scattered` makes it; all parts must be on one device.
+
+        Raises:
+            ValueError: a particle is not in the air in all frames.
+        """
+        flying = (history.births == 0) & (history.ends == history.frames)
+        if not bool(flying.all()):
+            raise ValueError(
+                f"a deformed cloud has neither births nor landings, but {int((~flying).sum())} of {len(history)} particles are "
+                f"not in the air in all {history.frames} frames"
+            )
+        self.history, self.look, self.deformation, self.learned_look = history, look, deformation, learned_look
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.history.frames
+
+    def refresh(self, progress: Progress | None = None) -> None:
+        """Nothing to do: without recurrence no state has to be kept."""
+
+    @torch.no_grad()
+    def gaussians(self, frame: int, visible: Bool[Tensor, "p"] | None = None) -> Gaussians:
+        """The Gaussians of any frame, without gradient.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        if not 0 <= frame < len(self):
+            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
+        return self._rendered(frame, self._at(frame, visible), None).gaussians
+
+    @torch.no_grad()
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolledFrame]:
+        """Frames start .. stop (exclusive) one after the other, without gradient."""
+        for frame in range(start, len(self) if stop is None else stop):
+            yield self._rendered(frame, self._at(frame, None), None)
+
+    def window(
+        self,
+        start: int,
+        frames: int,
+        *,
+        visible: Bool[Tensor, "p"] | None = None,
+        begin: Begin = "rollout",
+        gradient_frames: int | None = None,
+    ) -> list[RolledFrame]:
+        """A clip with gradient to network and learned look.
+
+        `begin` and `gradient_frames` speak of a recurrence and do nothing here. Deltas are the differences to the frame
+        before, so that the appearance terms of the loss mean what they do elsewhere.
+
+        Raises:
+            IndexError: the clip leaves the sequence.
+            FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
+        """
+        if frames < 1 or not 0 <= start <= len(self) - frames:
+            raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {len(self)} frames")
+        before, clip = self._at(start - 1, visible) if start else None, []
+        for frame in range(start, start + frames):
+            now = self._at(frame, visible)
+            clip.append(self._rendered(frame, now, before))
+            check_finite(clip[-1])
+            before = now
+        return clip
+
+    def _at(self, frame: int, visible: Bool[Tensor, "p"] | None) -> _Deformed:
+        ids = self.history.active(frame)
+        ids = ids if visible is None else ids[visible[ids]]
+        moved, rotation, change = self.deformation(self.history.positions_at(0, ids), frame)
+        change = accumulate(self._initial().active.select(ids), Change.none(len(ids), moved), change)
+        return _Deformed(ids, moved, turned(self.history.quats[ids], rotation), change)
+
+    def _initial(self) -> InitialLook:
+        return self.look if self.learned_look is None else self.learned_look(self.look)
+
+    def _rendered(self, frame: int, now: _Deformed, before: _Deformed | None) -> RolledFrame:
+        ids, moved, quats, change = now
+        look = changed(self._initial().active.select(ids), change)
+        places = self.history.positions_at(0, ids) + moved
+        gaussians = Gaussians(places, quats, look.scales, look.opacity, look.rgb)
+        deltas = None if before is None else _deltas(before, now)
+        return RolledFrame(frame, gaussians, ids, ids[:0], moved, quats, self.history.quats[ids], deltas)
+
+
+def _deltas(before: _Deformed, now: _Deformed) -> Deltas:
+    back = roma.quat_conjugation(roma.quat_wxyz_to_xyzw(before.quats))
+    rotation = roma.unitquat_to_rotvec(roma.quat_product(back, roma.quat_wxyz_to_xyzw(now.quats)))
+    change = Change(*(b - a for a, b in zip(before.change, now.change, strict=True)))
+    return Deltas(ActiveDelta(now.moved - before.moved, rotation, change), Change.none(0, now.moved))
