@@ -154,8 +154,8 @@ def test_a_language_model_is_asked_once_for_a_run_and_never_when_it_is_opened(
 
 def test_the_video_prior_is_told_what_the_words_say_unless_there_is_a_prompt(scene: Path):
     class Deaf:
-        def encode_prompt(self, texts: list[str]) -> list[str]:
-            return texts
+        def encode_prompt(self, texts: list[str]) -> torch.Tensor:
+            return torch.zeros(len(texts), 1, 1)
 
     words = parse("--load-scene", scene, "--data", scene.parent, "--weather", "purple snow").options()
     assert Guide.listening(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]

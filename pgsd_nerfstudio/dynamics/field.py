@@ -48,6 +48,8 @@ class DeltaBounds:
 class FieldConfig:
     """What the field may change."""
 
+    velocity: bool = True
+    """Whether motion in the air is corrected; off it stays the simulated one, the paper's "w/o PG" (with rotation off too)."""
     rotation: bool = True
     """Whether particles in the air turn; off there is no angular velocity to learn and orientations stay the simulated ones."""
     appearance: Literal["per particle", "shared", "fixed"] = "per particle"
@@ -102,7 +104,7 @@ class DynamicsField(nn.Module):
         self.frames, self.bounds, self.config = frames, bounds or DeltaBounds(), config or FieldConfig()
         self.register_buffer("box", box.detach().clone().float())
         self.register_buffer("speed", torch.tensor(max(float(speed), 1e-6)))
-        motion = {"velocity": 3, "rotation": 3} if self.config.rotation else {"velocity": 3}
+        motion = {name: 3 for name in ("velocity", "rotation") if getattr(self.config, name)}
         own = LOOK if self.config.appearance == "per particle" else {}
         self.active_net = StateNet({**motion, **own})
         self.collided_net = StateNet(own)
@@ -143,8 +145,10 @@ class DynamicsField(nn.Module):
         """Corrections for particles in the air."""
         own = torch.cat([self._place(position), _appearance(look), fourier((velocity / self.speed).clamp(-1, 1))], dim=1)
         out = self.active_net(own, self._time(frame))
-        rotation = self.bounds.rotation * out["rotation"] if self.config.rotation else torch.zeros_like(position)
-        return ActiveDelta(self.bounds.velocity * out["velocity"], rotation, self._change("active", out, frame, position))
+        still = torch.zeros_like(position)
+        velocity = self.bounds.velocity * out["velocity"] if self.config.velocity else still
+        rotation = self.bounds.rotation * out["rotation"] if self.config.rotation else still
+        return ActiveDelta(velocity, rotation, self._change("active", out, frame, position))
 
     def collided(self, position: Float[Tensor, "n 3"], frame: int, look: ParticleLook) -> Change:
         """Changes for particles at rest; their motion is fixed, their velocity enters as zero."""

@@ -14,7 +14,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
@@ -80,6 +80,8 @@ class Rollout:
         self.exposure, self.motion = exposure, motion
         self._keyframes: dict[int, State] = {}
         self._stamp: tuple[int, ...] = ()
+        self.refreshed: dict[str, Tensor] | None = None
+        """Weights that the kept states were made with; None before the first `refresh`."""
         self._last: State | None = None
 
     def __len__(self) -> int:
@@ -106,6 +108,28 @@ class Rollout:
                 if progress and state.frame:
                     progress(state.frame, last)
         self._keyframes, self._stamp, self._last = keyframes, weights, None
+        self.refreshed = self._copied()
+
+    @torch.no_grad()
+    def restore(self, refreshed: Mapping[str, Tensor]) -> None:
+        """The kept states as an interrupted training had them: made with the weights of its last `refresh`, while those that
+        have been learned since stay in use."""
+        learned = self._copied()
+        self._load(refreshed)
+        self.refresh()
+        self._load(learned)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"field": self.field, **({"look": self.learned_look} if self.learned_look else {})}
+
+    def _copied(self) -> dict[str, Tensor]:
+        return {
+            f"{name}.{k}": v.detach().clone() for name, part in self._modules().items() for k, v in part.state_dict().items()
+        }
+
+    def _load(self, weights: Mapping[str, Tensor]) -> None:
+        for name, part in self._modules().items():
+            part.load_state_dict({k.removeprefix(f"{name}."): v for k, v in weights.items() if k.startswith(f"{name}.")})
 
     @torch.no_grad()
     def gaussians(self, frame: int, visible: Bool[Tensor, "p"] | None = None) -> Gaussians:

@@ -47,8 +47,8 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
         "tensorboard"
     )
     """Where progress goes; a viewer shares the machine with the training."""
-    steps_per_save: int = 50
-    """Steps between checkpoints."""
+    steps_per_save: int = 10
+    """Steps between checkpoints, which are small: so many a crash may cost."""
     steps_per_eval_batch: int = 0
     """Steps between measurements of the drift on a random window; 0: never."""
     steps_per_eval_image: int = 0

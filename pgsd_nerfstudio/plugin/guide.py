@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from rich.console import Console
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, DistilledClip, distill_clip
 from pgsd_nerfstudio.guidance.folder import find_prior, read_config
 from pgsd_nerfstudio.guidance.prior import VideoPrior
+from pgsd_nerfstudio.guidance.prompts import embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule
+from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
+from pgsd_nerfstudio.guidance.variants import Embeddings
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 
 PAPER_FRAMES = 9
+
+console = Console(stderr=True, highlight=False)
 
 
 @dataclass(frozen=True)
@@ -25,8 +32,8 @@ class Guide:
     prior: VideoPrior
     wanted: str
     unwanted: str
-    embeddings: Float[Tensor, "2 l d"]
-    """Of both texts, in this order."""
+    embeddings: Embeddings
+    """Of all texts that the kind of distillation asks about, by role."""
     distillation: DistillationConfig
     timesteps: TimestepSchedule
     steps: int
@@ -40,16 +47,14 @@ class Guide:
             RunError: the text encoder cannot be used.
         """
         effect = options.chosen_effect()
-        wanted = options.prompt or effect.prompt_for(description)
         unwanted = effect.negative_prompt if options.negative_prompt is None else options.negative_prompt
+        prompts = prompts_for(effect.name, options.prompt or effect.prompt, unwanted, description)
         try:
-            embeddings = prior.encode_prompt([wanted, unwanted])
+            embeddings = embed_texts(prior, prompts.needed(options.distillation.variant))
         except (ValueError, OSError) as error:
             raise RunError(str(error)) from error
-        distillation = DistillationConfig(guidance_scale=options.guidance_scale)
-        return Guide(
-            prior, wanted, unwanted, embeddings, distillation, TimestepSchedule(), options.training_steps, options.training_seed
-        )
+        steps, seed = options.training_steps, options.training_seed
+        return Guide(prior, prompts.text, unwanted, embeddings, options.distillation, TimestepSchedule(), steps, seed)
 
     def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:
         """Which way the clip should change, in training step `step`; the noise depends on the seed and the step only.
@@ -60,9 +65,9 @@ class Guide:
         """
         draw = torch.Generator().manual_seed(1_000_003 * self.seed + step)
         timestep = self.timesteps.sample(step, self.steps, draw)
-        wanted, unwanted = self.embeddings[:1], self.embeddings[1:]
+        how = {"config": self.distillation, "generator": draw, "progress": step / self.steps}
         try:
-            return distill_clip(self.prior, clip, wanted, unwanted, timestep, config=self.distillation, generator=draw)
+            return distill_clip(self.prior, clip, self.embeddings, None, timestep, **how)
         except ValueError as error:
             raise RunError(str(error)) from error
 
@@ -76,6 +81,8 @@ def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[Vid
     try:
         native = int(read_config(find_prior(options.prior), "transformer").get("sample_frames", PAPER_FRAMES))
         prior = VideoPrior.load(options.prior, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
+        if options.tiny_vae is not None:
+            prior = _through_tiny(prior, options.tiny_vae)
     except (ValueError, OSError) as error:
         raise RunError(str(error)) from error
     frames, height, width = prior.clip_shape
@@ -85,3 +92,12 @@ def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[Vid
         )
     sizes = {"clip_height": options.clip_height or height, "clip_width": options.clip_width or width}
     return prior, replace(options, clip_frames=frames, **sizes)
+
+
+def _through_tiny(prior: VideoPrior, weights: Path) -> VideoPrior:
+    """The prior with a tiny encoder before it; says how far their gradients agree on a clip of noise in the prior's size."""
+    tiny = TinyEncoder.load(weights, prior.device, prior.dtype)
+    frames, height, width = prior.clip_shape
+    clip = torch.rand(frames, 3, height, width, generator=torch.Generator().manual_seed(0)).to(prior.device)
+    console.print(f"tiny VAE {weights.name}: cosine of its gradient with the full one {gradient_cosine(prior, tiny, clip):.3f}")
+    return prior.through(tiny)

@@ -21,7 +21,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout
+from pgsd_nerfstudio.dynamics import Deformation, DeformedCloud, DynamicsField, LearnedLook, Rollout
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
@@ -35,7 +35,7 @@ from pgsd_nerfstudio.response.answer import Answer, Shown, baked
 from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather import initial_look
+from pgsd_nerfstudio.weather import InitialLook, initial_look
 
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
 STRIDE = 8  # frames between kept states: a jump in time, and the start of a training clip, costs 3.5 frames on average
@@ -67,16 +67,40 @@ class WeatherModel(SplatfactoModel):
         options = self.config.options
         look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
         look = in_place(look, self.history, self.answer, self.stage.scene.frame.to_metric(self.stage.scene.gaussians.means))
-        self.field = DynamicsField.for_history(self.history)
         self.look = LearnedLook().to(self.history.device)
-        exposure = options.chosen_effect().appearance.exposure
-        self.rollout = Rollout(self.history, look, self.field, self.look, stride=STRIDE, exposure=exposure)
+        self.field, self.rollout = self._moving(look)
+        self._refreshed: dict[str, Tensor] | None = None
         self.weather = Panel(self.stage.scene, options.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
         self._untimed = 0
         self._cropped: tuple[Any, Tensor, Rasterizer] | None = None
         self._exported: dict[str, Tensor] | None = None
+
+    def _moving(self, look: InitialLook) -> tuple[torch.nn.Module, Rollout | DeformedCloud]:
+        """What is learned of motion and appearance, and what rolls it out."""
+        options = self.config.options
+        if options.motion == "deformation":
+            box = torch.tensor(self.history.about["domain"]).reshape(2, 3).to(self.history.device)
+            deformation = Deformation(box, self.history.frames).to(self.history.device)
+            return deformation, DeformedCloud(self.history, look, deformation, self.look)
+        dynamics = DynamicsField.for_history(self.history, config=options.dynamics)
+        exposure = options.chosen_effect().appearance.exposure
+        how = {"stride": STRIDE, "exposure": exposure, "motion": options.motion}
+        return dynamics, Rollout(self.history, look, dynamics, self.look, **how)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Weights with which the states were made that clips start from: an interrupted training goes on from those."""
+        return dict(getattr(self.rollout, "refreshed", None) or {})
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        self._refreshed = state or None
+
+    def go_on(self) -> None:
+        """Training goes on after a checkpoint was loaded: to the same bits as if it had not been broken off."""
+        if self._refreshed is not None and isinstance(self.rollout, Rollout):
+            self.rollout.restore(self._refreshed)
+        self._refreshed = None
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         return {"field": list(self.field.parameters()), "look": list(self.look.parameters())}

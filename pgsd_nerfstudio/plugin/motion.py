@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from pgsd_nerfstudio.dynamics import scattered
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
@@ -43,7 +44,7 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
         RunError: the scene cannot hold this weather, or the disk is full.
     """
     from pgsd_nerfstudio.physics.prior import motion_prior
-    from pgsd_nerfstudio.surface.mesh import surface_of
+    from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
 
     try:
         surface = surface_of(stage.scene, stage.rasterizer)
@@ -51,7 +52,7 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
         effect, most = options.chosen_effect(), options.max_particles
         history = motion_prior(
             stage.scene,
-            surface,
+            surface if options.collisions else SurfaceMesh.empty(),
             effect,
             clock,
             seed=options.weather_seed,
@@ -59,6 +60,11 @@ def prepare_motion(stage: Stage, options: WeatherOptions, run_folder: Path | Non
             profile=options.physics,
             everything=options.everything,
         )
+        if options.motion == "deformation":
+            # As many, in the same box and sizes; the domain goes along with the simulation's account.
+            box = torch.tensor(history.about["domain"]).reshape(2, 3)
+            count = int(((history.births <= 0) & (history.ends > 0)).sum()) or len(history)
+            history = replace(scattered(box, history, count, seed=options.weather_seed), about=history.about)
         made_for = {"splat": _splat_key(stage.scene), "frame": _written(stage.scene.frame)}
         history = replace(history, about={**history.about, **made_for})
         edits = None

@@ -10,7 +10,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,9 @@ import torch
 import tyro
 
 from pgsd_nerfstudio import __version__
+from pgsd_nerfstudio.dynamics import FieldConfig, RegularizationWeights
+from pgsd_nerfstudio.guidance.distillation import DistillationConfig
+from pgsd_nerfstudio.guidance.schedules import Weighting
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.weather.asking import Granted
 from pgsd_nerfstudio.weather.effect import Effect
@@ -75,16 +78,34 @@ class WeatherOptions(Knobs, SceneOptions):
     """Training steps. By default the paper's 1000 with CUDA, on a CPU 60, as many as pass in a few minutes with the bundled
     prior. That one has only seen snow: for any other weather it teaches nothing good, so that by default nothing is learned
     from it, and the run keeps the simulated motion and the curated look."""
-    guidance_scale: float = 100.0
-    """How strongly the prompt outweighs its negative, as in the paper."""
+    distillation: DistillationConfig = field(default_factory=DistillationConfig)
+    """How the video prior's predictions become a gradient; the paper's ablations of SDS variants."""
+    tiny_vae: Path | None = None
+    """Weights of taecvx (.safetensors or .pth), a small encoder in place of the prior's own, at a fraction of memory
+    and time. How far its gradient agrees with the full one is printed at the start."""
+    dynamics: FieldConfig = field(default_factory=FieldConfig)
+    """What the field may change; the paper's ablations of fixed appearance, fixed rotation and fixed motion ("w/o PG")."""
+    motion: Literal["particle", "field", "deformation"] = "particle"
+    """What moves a particle that has left its simulated path: its own simulated velocity (the paper), that of the place where
+    it is (field), or no simulation at all but a learned deformation of scattered particles (the paper's "w/o Motion")."""
+    collisions: bool = True
+    """Whether the motion prior meets the scene's surface; off particles fall through it (the paper's "w/o CH")."""
+    begin: Literal["rollout", "simulation"] = "rollout"
+    """Where a training clip starts: from the state that the roll-out reaches, or from the simulation (the paper's code), which
+    never shows training the drift of the full-length video."""
+    gradient_frames: int | None = None
+    """Frames through which the gradient follows the recurrence: the whole clip by default, 1 as in the paper's code."""
+    regularization: RegularizationWeights = field(default_factory=RegularizationWeights)
+    """Weights of the physics and appearance losses; --regularization.without xyz leaves one out, app all of the appearance."""
     lr: float = 1e-4 if CUDA else 1e-3
     """Learning rate of the field at the start, falling to zero along a cosine. The paper's 1e-4 is meant for 1000 steps; the
     few steps of a CPU need the larger one."""
     look_lr: float = 2e-3 if CUDA else 2e-2
     """Learning rate of the look that all particles share, along the same cosine: 14 numbers (logits, log scales, colours), each
     of which can move by no more than the sum of all rates."""
-    weights: Literal["adaptive", "constant"] = "adaptive"
-    """How the physics and appearance losses are weighed: times the magnitude of the video loss (the paper), or as they are."""
+    weights: Weighting = "adaptive"
+    """How the physics and appearance losses are weighed: times the magnitude of the video loss (the paper), as they are, or by
+    one of the paper's schedules over the training (all three worse, it says)."""
     trajectory: Literal["near", "any"] = "near"
     """Camera path of a training clip: from a random training view to one of the six nearest, or to any other, as in the paper
     (whose straight way through a ring of views leads across its middle within a third of a second)."""
@@ -166,6 +187,10 @@ class WeatherOptions(Knobs, SceneOptions):
         for name, value in positive.items():
             if not value > 0:
                 raise RunError(f"--{name} must be positive, got {value}")
+        if self.gradient_frames is not None and self.gradient_frames < 1:
+            raise RunError(f"--gradient-frames must be at least 1, got {self.gradient_frames}")
+        if self.tiny_vae is not None and not self.tiny_vae.is_file():
+            raise RunError(f"no tiny VAE at {self.tiny_vae}: expected a file with the weights of taecvx")
         if not 0.0 <= self.export_time <= 1.0:
             raise RunError(f"--export-time must lie in 0-1, got {self.export_time}")
         if self.layers is not None and (CUDA or self.layers < 1):

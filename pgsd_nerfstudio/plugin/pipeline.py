@@ -21,7 +21,7 @@ from nerfstudio.utils import writer
 from rich.console import Console
 from torch import Tensor
 
-from pgsd_nerfstudio.dynamics import RegularizationWeights, drift, regularization
+from pgsd_nerfstudio.dynamics import drift, regularization
 from pgsd_nerfstudio.guidance.distillation import DistilledClip
 from pgsd_nerfstudio.guidance.schedules import regularization_scale
 from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surrogate
@@ -77,6 +77,8 @@ class WeatherPipeline(VanillaPipeline):
             RunError: the motion prior or the video prior cannot be made or found.
         """
         Pipeline.__init__(self)
+        self.completed: int | None = None
+        """The last training step that was done as a whole."""
         self._skipped = self._skipped_in_all = 0
         self._layers_judged = False
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
@@ -129,12 +131,15 @@ class WeatherPipeline(VanillaPipeline):
         cameras, batch = self.datamanager.next_train(step)
         views, start = from_nerfstudio(cameras), int(batch["start"])
         background = model.background_color.to(stage.device)
+        model.go_on()
         if step % options.refresh_every == 0:
             with watch("refresh"):
                 model.rollout.refresh()
         with watch("roll-out"):
-            seen = seen_by(stage, views, model.history, start)
-            rolled = model.rollout.window(start, len(views), visible=seen)
+            # What is deformed is not where it was scattered.
+            seen = None if options.motion == "deformation" else seen_by(stage, views, model.history, start)
+            how = {"begin": options.begin, "gradient_frames": options.gradient_frames}
+            rolled = model.rollout.window(start, len(views), visible=seen, **how)
             weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
             answering = options.answering_clips
@@ -149,9 +154,9 @@ class WeatherPipeline(VanillaPipeline):
             video, norms = surrogate(stage, views, weather, background, moments, distilled.gradient)
         with watch("regularize"):
             terms = regularization(rolled, model.look)
-            scale = regularization_scale(options.weights, distilled.loss)
-            weights = RegularizationWeights()
-            losses = {name: scale * getattr(weights, name) * value for name, value in terms.items()}
+            scale = regularization_scale(options.weights, distilled.loss, step, options.training_steps)
+            weights = options.regularization
+            losses = weights.weighted(terms, scale)
         with torch.no_grad():
             metres = drift(rolled)
         if options.clip_every and step % options.clip_every == 0:
@@ -164,8 +169,8 @@ class WeatherPipeline(VanillaPipeline):
             "drift_m": metres,
             "skipped": self._skipped_in_all,
             "memory_mb": _memory(stage.device),
-            **{f"weight/{name}": scale * getattr(weights, name) for name in terms},
-            "particles_seen": int(seen.sum()),
+            **{f"weight/{name}": scale * weights.of(name) for name in terms},
+            "particles_seen": len(model.history) if seen is None else int(seen.sum()),
             **{f"gradient/{name}": norm for name, norm in norms.items()},
             **{f"seconds/{name}": seconds for name, seconds in watch.seconds.items()},
         }
@@ -194,12 +199,13 @@ class WeatherPipeline(VanillaPipeline):
         return {}, {"drift_m": torch.tensor(metres)}, {}
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """After each step the norms of its gradients go to the log; at the end the kept states follow the last weights."""
+        """After each step the norms of its gradients go to the log."""
         return [
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._log_gradients, update_every_num_iters=1),
         ]
 
     def _log_gradients(self, step: int) -> None:
+        self.completed = step
         for group, parameters in self.model.get_param_groups().items():
             found = [p.grad for p in parameters if p.grad is not None]
             if found:

@@ -27,7 +27,8 @@ def print_summary(console: Console, options: WeatherOptions, stage: Stage, histo
         "wanted": guide.wanted,
         "not wanted": guide.unwanted,
         "clips": f"{options.clip_frames} frames of {options.clip_width}x{options.clip_height}, paths: {options.trajectory}",
-        "training": f"{options.training_steps} steps, guidance {options.guidance_scale:g}, weights {options.weights}, "
+        "training": f"{options.training_steps} steps, {options.distillation.variant} with guidance "
+        f"{options.distillation.guidance_scale:g}, weights {options.weights}, "
         f"learning rates {options.rates['field']:g} (field) and {options.rates['look']:g} (look)",
     }
     table = Table(title="pgsd-weather", show_header=False, title_justify="left", title_style="bold")

@@ -10,12 +10,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
 
 
 class WeatherTrainer(Trainer):
     """Trains one weather on one device."""
 
     config: Any  # WeatherTrainerConfig, whose module imports this one
+    pipeline: WeatherPipeline
 
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
@@ -31,22 +33,37 @@ class WeatherTrainer(Trainer):
         self.config.save_config()
 
     def train(self) -> None:
-        """Train to the end, or to Ctrl-C: then what was learned so far is saved, and the way to go on is said."""
+        """Train to the end, or to Ctrl-C: then what was learned so far is saved, and the way to go on is said.
+
+        A run that was broken off goes on to the end that it was given and, on a CPU, to the same bits; one that was finished is
+        trained for as many steps again.
+        """
+        if 0 < self._start_step < self.config.max_num_iterations:
+            self.config.max_num_iterations -= self._start_step
         try:
             super().train()
         except KeyboardInterrupt:
-            self.save_checkpoint(self.step)
-            CONSOLE.print(
-                f"Interrupted at step {self.step}; to go on, add to the same command: --load-dir {self.checkpoint_dir}"
-            )
+            if self._kept():
+                again = f"to go on, add to the same command: --load-dir {self.checkpoint_dir}"
+                CONSOLE.print(f"Interrupted after step {self.pipeline.completed}; {again}", soft_wrap=True)
             return
         except RunError:
             # Nothing of the steps before is lost to what broke this one.
-            self.save_checkpoint(self.step)
-            CONSOLE.print(f"Stopped at step {self.step}; what was learned lies in {self.checkpoint_dir}", soft_wrap=True)
+            if self._kept():
+                CONSOLE.print(
+                    f"What was learned until step {self.pipeline.completed} lies in {self.checkpoint_dir}", soft_wrap=True
+                )
             raise
         config = self.config.get_base_dir() / "config.yml"
         stage: Any = self.pipeline.model.stage
         CONSOLE.print(f"Frozen scene while training: {stage.clip_rasterizer.memory}", soft_wrap=True)
         CONSOLE.print(f"Look at it: ns-viewer --load-config {config}", soft_wrap=True)
         CONSOLE.print(f"A video: ns-render interpolate --load-config {config} --output-path snow.mp4", soft_wrap=True)
+
+    def _kept(self) -> bool:
+        """Save what the last whole step has learned; False where there was none."""
+        if self.pipeline.completed is None:
+            CONSOLE.print("Interrupted before the first step was done: nothing is learned yet")
+            return False
+        self.save_checkpoint(self.pipeline.completed)
+        return True
