@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
+import torch
 import tyro
 import yaml
 from plugin_scene import tiny_config, write_scene

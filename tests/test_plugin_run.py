@@ -245,7 +245,8 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_bits(trained: Path, prior
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, ends[1]["pipeline"][key]), key
     for key, value in ends[0]["optimizers"]["field"]["state"].items():
-        assert all(torch.equal(a, b) for a, b in zip(value.values(), ends[1]["optimizers"]["field"]["state"][key].values()))
+        other = ends[1]["optimizers"]["field"]["state"][key]
+        assert all(torch.equal(moment, other[name]) for name, moment in value.items())
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pgsd_nerfstudio.cli import rows_drift
 from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.dynamics import (
@@ -170,6 +171,7 @@ def bench(quick: bool) -> list[Record]:
         Record("one frame of the roll-out, per particle", frame * per_particle, "µs", **unit),
         Record(f"clip of {CLIP} frames with gradient, per particle and frame", clip * per_particle / CLIP, "µs", **unit),
         Record("one frame of an untrained roll-out, per particle", shown * per_particle, "µs", 0.0, "m"),
+        *rows_drift.rows(quick),
     ]
 
 

@@ -10,6 +10,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
+from pgsd_nerfstudio.cli import rows_prior_costs
 from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.cli.timing import best
 from pgsd_nerfstudio.guidance import (
@@ -117,7 +118,11 @@ def verify(quick: bool) -> list[Record]:
 
 
 def bench(quick: bool) -> list[Record]:
-    """Cost of a training step's guidance with the bundled prior."""
+    """Cost of a training step's guidance with the bundled prior, and of one with CogVideoX-2B by count."""
+    return [*_bundled_costs(), *rows_prior_costs.rows(quick)]
+
+
+def _bundled_costs() -> list[Record]:
     names = ("VAE encoder, forward and backward", "guidance pair of the transformer", "distillation of one clip")
     try:
         prior, text, negative = _bundled()

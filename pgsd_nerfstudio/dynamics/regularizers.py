@@ -48,15 +48,21 @@ class RegularizationWeights:
     """Shift of the look that all particles share; not in the paper, which regularizes changes from frame to frame only."""
     without: tuple[str, ...] = ()
     """Terms to leave out, by the names above; "app" names all six of the appearance per frame, as the paper's ablation does."""
+    constant: tuple[str, ...] = ()
+    """Terms whose weight stays as it is, whatever scales the others; the paper's study of drift holds xyz so."""
     times: float = 1.0
     """Factor on all terms; the paper's study of sensitivity tries 0.1 and 10, on one term at a time."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a term to leave out does not exist, or the factor is negative."""
-        known = [f.name for f in fields(self) if f.name not in ("without", "times")] + ["app"]
-        unknown = [name for name in self.without if name not in known]
-        if unknown:
-            raise ValueError(f"terms to leave out must be among {', '.join(known)}; found {', '.join(unknown)}")
+        known = [f.name for f in fields(self) if f.name not in ("without", "constant", "times")]
+        for what, names, known_here in (
+            ("to leave out", self.without, [*known, "app"]),
+            ("of constant weight", self.constant, known),
+        ):
+            unknown = [name for name in names if name not in known_here]
+            if unknown:
+                raise ValueError(f"terms {what} must be among {', '.join(known_here)}; found {', '.join(unknown)}")
         if not self.times >= 0:
             raise ValueError(f"the factor on all terms must not be negative, got {self.times}")
 
@@ -65,14 +71,18 @@ class RegularizationWeights:
         out = name in self.without or ("app" in self.without and name in APPEARANCE)
         return 0.0 if out else self.times * getattr(self, name)
 
+    def scaled(self, name: str, scale: float) -> float:
+        """The weight of one term in a step where the others are scaled by `scale`."""
+        return self.of(name) * (1.0 if name in self.constant else scale)
+
     def weighted(self, terms: Mapping[str, Tensor], scale: float = 1.0) -> dict[str, Tensor]:
         """Each term times its weight and `scale`, without those of weight zero."""
-        return {name: scale * self.of(name) * value for name, value in terms.items() if self.of(name)}
+        return {name: self.scaled(name, scale) * value for name, value in terms.items() if self.of(name)}
 
     def total(self, terms: Mapping[str, Tensor], scale: float = 1.0) -> Tensor:
         """Weighted sum of `terms`, times `scale`."""
-        used = [self.of(name) * value for name, value in terms.items() if self.of(name)]
-        return scale * torch.stack(used).sum() if used else torch.zeros_like(next(iter(terms.values())))
+        used = list(self.weighted(terms, scale).values())
+        return torch.stack(used).sum() if used else torch.zeros_like(next(iter(terms.values())))
 
 
 def regularization(clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None) -> dict[str, Tensor]:

@@ -169,7 +169,7 @@ class WeatherPipeline(VanillaPipeline):
             "drift_m": metres,
             "skipped": self._skipped_in_all,
             "memory_mb": _memory(stage.device),
-            **{f"weight/{name}": scale * weights.of(name) for name in terms},
+            **{f"weight/{name}": weights.scaled(name, scale) for name in terms},
             "particles_seen": len(model.history) if seen is None else int(seen.sum()),
             **{f"gradient/{name}": norm for name, norm in norms.items()},
             **{f"seconds/{name}": seconds for name, seconds in watch.seconds.items()},
