@@ -224,11 +224,12 @@ def test_the_same_seed_learns_the_same(trained: Path, prior: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("broken_at", [1, 3, 4])
 def test_a_run_that_was_broken_off_goes_on_to_the_same_bits(trained: Path, prior: Path, tmp_path: Path, monkeypatch, broken_at):
-    """Kept states are made every second step, so that they are older than the weights at an odd one."""
+    """Kept states are made every second step, so that they are older than the weights at an odd one; long enough for clips to
+    start far from frame 0, where all states are the same."""
     from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
 
     scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
-    whole = train(tiny_config(scene, prior, tmp_path / "whole", steps=6))
+    whole = train(tiny_config(scene, prior, tmp_path / "whole", steps=6, seconds=2.4))
     step_before = WeatherPipeline.get_train_loss_dict
 
     def interrupted(self: WeatherPipeline, step: int):
@@ -238,8 +239,8 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_bits(trained: Path, prior
 
     with monkeypatch.context() as patch:
         patch.setattr(WeatherPipeline, "get_train_loss_dict", interrupted)
-        part = train(tiny_config(scene, prior, tmp_path / "part", steps=6))
-    rest = train(tiny_config(scene, prior, tmp_path / "rest", steps=6, load_dir=part.parent / "nerfstudio_models"))
+        part = train(tiny_config(scene, prior, tmp_path / "part", steps=6, seconds=2.4))
+    rest = train(tiny_config(scene, prior, tmp_path / "rest", steps=6, seconds=2.4, load_dir=part.parent / "nerfstudio_models"))
     ends = [torch.load(config.parent / "nerfstudio_models" / "step-000000005.ckpt") for config in (whole, rest)]
     for key, value in ends[0]["pipeline"].items():
         if isinstance(value, torch.Tensor):
