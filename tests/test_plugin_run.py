@@ -164,6 +164,10 @@ def test_the_crop_box_of_the_viewer_cuts_scene_and_weather(run: Path):
     cut = pipeline.model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
     whole = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
     assert 0.01 < float(cut.mean()) < 0.6 * float(whole.mean())
+    prepared = pipeline.model._inside(box)[1].views
+    held = len(prepared)
+    pipeline.model.get_outputs_for_camera(camera, obb_box=box)
+    assert len(prepared) == held, "the same view of the same moment is prepared once"
 
 
 def test_a_run_without_its_motion_prior_names_the_command_that_makes_it(run: Path, tmp_path: Path):

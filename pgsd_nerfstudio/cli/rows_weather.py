@@ -14,20 +14,20 @@ from pgsd_nerfstudio.cli.records import Record
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.medium import Medium
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.rendering.reference import render_reference
-from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.haze import HazeField
 from pgsd_nerfstudio.response.layers import Layers
-from pgsd_nerfstudio.response.prepare import sun_of, to_metric
+from pgsd_nerfstudio.response.prepare import composed, sun_of, to_metric
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.courtyard.baking import SUN
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
-from pgsd_nerfstudio.weather.effect import EFFECTS, Effect, effect
+from pgsd_nerfstudio.weather.effect import EFFECTS, effect
 from pgsd_nerfstudio.weather.spell import Spell
 
 VISIBILITIES = (20.0, 50.0, 200.0)  # m
@@ -106,7 +106,7 @@ class _Air:
 
     key = b"air"
 
-    def __init__(self, medium) -> None:  # type: ignore[no-untyped-def]
+    def __init__(self, medium: Medium) -> None:
         self.medium = medium
         self.seen_behind = torch.zeros(3)
 
@@ -186,9 +186,10 @@ def _first_second(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
     camera = scene.cameras[0].resized(160, 108)
     rasterizer = choose_rasterizer(scene.gaussians, "cpu")
     plain = rasterizer.render(camera).rgb
-    differ, later = 0, []
+    metric, differ, later = to_metric(scene), 0, []
     for each in EFFECTS.values():
-        answer = _open_answer(scene, surface, replace(each, spell=Spell(onset=max(each.spell.onset, 2.0))))
+        clear = replace(each, spell=Spell(onset=max(each.spell.onset, 2.0)))
+        answer = composed(scene, clear, Exposure.of(metric, surface, clear))
         differ += int((rasterizer.render(camera, None, None, answer.at(0.0)).rgb != plain).sum())
         later.append(float((rasterizer.render(camera, None, None, answer.at(6.0)).rgb - plain).abs().mean()))
     yield Record.judged(
@@ -197,20 +198,6 @@ def _first_second(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
         "",
         "== 0",
         source=f"{', '.join(EFFECTS)} on the demo; after 6 s they differ by {min(later):.3f}-{max(later):.3f} on average",
-    )
-
-
-def _open_answer(scene: Scene, surface: SurfaceMesh, what: Effect) -> Answer:
-    metric = to_metric(scene)
-    exposure = Exposure.of(metric, surface, what)
-    return Answer(
-        effect=what,
-        exposure=exposure,
-        layers=Layers.of(what, exposure, metric.means),
-        softening=None,
-        up=scene.frame.rotation,
-        metres_per_unit=scene.frame.metres_per_unit,
-        haze=HazeField.of(what, scene.frame, domain_of(scene)),
     )
 
 

@@ -75,6 +75,7 @@ class WeatherModel(SplatfactoModel):
         self.crop_box: OrientedBox | None = None
         self._untimed = 0
         self._cropped: tuple[Any, Tensor, Rasterizer] | None = None
+        self._cropped_answer: tuple[int, Tensor, Answer] | None = None
         self._exported: dict[str, Tensor] | None = None
 
     def _moving(self, look: InitialLook) -> tuple[torch.nn.Module, Rollout | DeformedCloud]:
@@ -168,7 +169,7 @@ class WeatherModel(SplatfactoModel):
             if box is not None:
                 inside, rasterizer = self._inside(box)
                 weather = None if weather is None else weather.select(box.within(weather.means).reshape(-1))
-                answer = None if answer is None else answer.select(inside)
+                answer = None if answer is None else self._part(answer, inside)
             moment = None if answer is None else self.moment(frame, answer)
             return rasterizer.render(views, weather, self.background_color.to(self.device), moment)
 
@@ -180,6 +181,12 @@ class WeatherModel(SplatfactoModel):
             inside = box.within(frozen.means).reshape(-1)
             self._cropped = (key, inside, choose_rasterizer(frozen.select(inside), self.device))
         return self._cropped[1:]
+
+    def _part(self, answer: Answer, inside: Tensor) -> Answer:
+        """The answer of what lies in the crop box, the last one kept: a new one would make all prepared views useless."""
+        if self._cropped_answer is None or self._cropped_answer[0] != answer.number or self._cropped_answer[1] is not inside:
+            self._cropped_answer = answer.number, inside, answer.select(inside)
+        return self._cropped_answer[2]
 
     def _outputs(self, rendering: Rendering) -> dict[str, Tensor]:
         rgb = rendering.rgb[0].clamp(0, 1)

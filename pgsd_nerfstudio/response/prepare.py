@@ -53,7 +53,7 @@ def answer_of(
         metric = to_metric(scene)
         exposure = Exposure.of(metric, surface, effect, seed=seed)
         softening = softening_of(metric, exposure, surface, effect)
-        answer = _answer(scene, effect, exposure, softening, seconds, seed, None)
+        answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed)
         save_answer(path, answer)
     return replace(answer, edits=edits)
 
@@ -82,18 +82,21 @@ def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, s
     edited = {name.removeprefix("edited."): tensors.pop(name) for name in list(tensors) if name.startswith("edited.")}
     if set(tensors) != {f.name for f in fields(Exposure)} or len(tensors["sky"]) != len(scene.gaussians):
         return None
-    return _answer(scene, effect, Exposure(**tensors), softening, seconds, seed, Edits(**edited) if edited else None)
+    edits = Edits(**edited) if edited else None
+    return composed(scene, effect, Exposure(**tensors), softening, seconds=seconds, seed=seed, edits=edits)
 
 
-def _answer(
+def composed(
     scene: Scene,
     effect: Effect,
     exposure: Exposure,
-    softening: Float[Tensor, "n"] | None,
-    seconds: float,
-    seed: int,
-    edits: Edits | None,
+    softening: Float[Tensor, "n"] | None = None,
+    *,
+    seconds: float = 10.0,
+    seed: int = 0,
+    edits: Edits | None = None,
 ) -> Answer:
+    """The answer from what rays have found out; haze and layers follow from the effect."""
     return Answer(
         effect=effect,
         exposure=exposure,
