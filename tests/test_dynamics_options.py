@@ -246,16 +246,29 @@ def test_gap_is_what_training_clips_do_not_see_of_a_steady_drift():
     assert gap(roll, [(10, 4), (31, 9)], begin="rollout").difference == pytest.approx(0.0, abs=1e-6)
 
 
-def test_gap_of_clips_from_the_rollout_is_what_stale_states_cost():
-    """Kept states of 5 mm a frame, weights of now 10 mm: a clip from frame 16 starts at 14 kept frames and has 2 more."""
+def test_a_clip_starts_where_the_present_weights_have_led_what_flies_and_older_ones_what_lies():
+    """Kept states of 5 mm a frame, weights of now 10 mm: a clip that starts at frame 16 is 16 times 10 mm off, gap or no gap."""
     roll = steady()
     roll.refresh()
     with torch.no_grad():
         roll.field.active_net.heads["velocity"].bias[0] = torch.atanh(torch.tensor(0.01 / roll.field.bounds.velocity))
     kept = dict(roll._keyframes)
-    seen, shown, _ = gap(roll, [(16, 1)], begin="rollout")
-    assert (seen, shown) == (pytest.approx(14 * 0.005 + 2 * 0.01, rel=1e-4), pytest.approx(16 * 0.01, rel=1e-4))
+    assert gap(roll, [(16, 1)], begin="rollout") == (pytest.approx(0.16, rel=1e-4), pytest.approx(0.16, rel=1e-4), 0.0)
     assert roll.stale and roll._keyframes == kept
+
+    roll = rollout(falling(), weights=0.3)
+    roll.refresh()
+    lying = roll.window(29, 1)[0].gaussians.colors[len(roll.history.active(29)) :].detach()
+    with torch.no_grad():
+        for head in roll.field.heads():
+            head.bias += 0.3
+    again = roll.window(29, 1)[0]
+    assert not torch.equal(again.gaussians.colors[len(again.active) :], lying)  # its last frames are of now
+    whole = next(roll.afresh([29]))
+    torch.testing.assert_close(again.gaussians.means, whole.gaussians.means, rtol=0, atol=2e-6)
+    torch.testing.assert_close(again.quats, whole.quats, rtol=0, atol=2e-6)
+    flying = len(again.active)
+    torch.testing.assert_close(again.gaussians.colors[:flying], whole.gaussians.colors[:flying], rtol=0, atol=2e-6)
 
 
 def test_gap_is_zero_untrained_and_without_clips():

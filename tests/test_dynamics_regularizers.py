@@ -9,7 +9,7 @@ from dynamics_particles import falling, rollout
 
 from pgsd_nerfstudio.dynamics import RegularizationWeights, drift, regularization
 from pgsd_nerfstudio.dynamics.look import OPACITY_UNIT
-from pgsd_nerfstudio.dynamics.regularizers import APPEARANCE, rotation_angle, safe_norm
+from pgsd_nerfstudio.dynamics.regularizers import APPEARANCE, quaternion_difference, rotation_angle, safe_norm
 
 
 def quaternions(count: int) -> torch.Tensor:
@@ -42,6 +42,16 @@ def test_rotation_gradient_is_finite(case):
     torch.testing.assert_close(angle, torch.full((30,), truth), rtol=0, atol=1e-5)
     (gradient,) = torch.autograd.grad(angle.sum(), a)
     assert torch.isfinite(gradient).all() and gradient.norm(dim=1).max() < 2.5
+
+
+def test_quaternion_difference_is_that_of_the_nearer_sign_and_a_quarter_of_the_squared_angle():
+    a, b = quaternions(200), quaternions(400)[200:]
+    nearer = torch.minimum((a - b).square().sum(1), (a + b).square().sum(1))
+    torch.testing.assert_close(quaternion_difference(a, b), nearer, rtol=0, atol=1e-14)
+    slightly = roma.quat_xyzw_to_wxyz(
+        roma.quat_product(roma.quat_wxyz_to_xyzw(a), roma.rotvec_to_unitquat(0.01 * torch.randn(200, 3, dtype=torch.float64)))
+    )
+    torch.testing.assert_close(quaternion_difference(slightly, a), rotation_angle(slightly, a).square() / 4, rtol=1e-3, atol=1e-8)
 
 
 def test_norm_is_the_norm_and_smooth_at_zero():
@@ -90,6 +100,30 @@ def test_terms_are_means_over_gaussians_and_frames():
     assert terms["look"] == pytest.approx(0.5, rel=0.05)
 
 
+def test_squares_are_means_of_the_squares_of_what_the_norms_measure():
+    roll = rollout(falling(), weights=0.1)
+    assert roll.learned_look is not None
+    with torch.no_grad():
+        roll.learned_look.active += 0.05
+    clip = roll.window(10, 5)
+    terms = regularization(clip, roll.learned_look, "squares")
+    assert terms.keys() == regularization(clip, roll.learned_look).keys()
+    stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
+
+    def mean(parts):
+        return float(torch.cat([part.detach().reshape(len(part), -1).square().sum(1) for part in parts]).mean())
+
+    truth = {
+        "xyz": mean(rolled.offset for rolled in clip),
+        "vel": mean(deltas.active.velocity for deltas in stepped),
+        "active_scale": mean(deltas.active.change.log_scale for deltas in stepped),
+        "collided_rgb": mean(deltas.resting.rgb for deltas in stepped),
+        "look": sum(float(x.detach().square().sum()) for shift in roll.learned_look.bounded() for x in shift),
+    }
+    for name, value in truth.items():
+        assert value > 0 and float(terms[name].detach()) == pytest.approx(value, rel=1e-5), name
+
+
 def test_weights_are_the_papers_and_scale_together():
     weights, one = RegularizationWeights(), torch.ones(())
     assert (weights.xyz, weights.vel, weights.rot) == (0.1, 0.1, 0.1)
@@ -133,7 +167,7 @@ def test_a_term_left_out_takes_its_weight_from_the_sum(name):
 def test_without_app_leaves_motion_and_look():
     weights = RegularizationWeights(without=("app",))
     assert set(weights.weighted(ONES)) == {"xyz", "vel", "rot", "look"}
-    assert float(weights.total(ONES)) == pytest.approx(0.31)
+    assert float(weights.total(ONES)) == pytest.approx(0.301)
 
 
 @pytest.mark.parametrize("times", [0.1, 10.0])

@@ -83,11 +83,17 @@ def test_guidance_of_the_papers_code_is_one_scale_further():
     )
 
 
-def test_loss_magnitude_is_half_the_squared_gradient_per_frame():
-    found = distill(
-        Prior(0.4), torch.randn(SHAPE), TEXT, NEGATIVE, 300, config=DistillationConfig(), generator=seeded(), frames=9
+def test_gradient_is_that_of_the_loss_for_a_target_held_fixed():
+    """The paper's code: 1/2 |z - stop_gradient(z - g)|^2 / frames, g = omega (eps_hat - eps)."""
+    latents = torch.randn(SHAPE, requires_grad=True)
+    whole, found = (
+        distill(Prior(0.4), latents, TEXT, NEGATIVE, 300, config=DistillationConfig(), generator=seeded(), frames=frames)
+        for frames in (1, 9)
     )
-    assert found.loss == pytest.approx(0.5 * float(found.gradient.square().sum()) / 9, rel=1e-5)
+    loss = 0.5 * (latents - (latents - whole.gradient).detach()).square().sum() / 9
+    (gradient,) = torch.autograd.grad(loss, latents)
+    torch.testing.assert_close(found.gradient, gradient, rtol=1e-5, atol=1e-5)
+    assert found.loss == pytest.approx(float(loss.detach()), rel=1e-5) and found.loss > 0
 
 
 def test_gradient_is_bounded_and_keeps_its_direction():
@@ -185,7 +191,7 @@ def test_guidance_leads_away_from_the_negative_prompt():
 
 
 def test_gradient_on_the_clip_is_autograd_of_the_explicit_expression(tmp_path):
-    """d/d clip of sum(stop_gradient(g) * latents(clip)), and of the paper's code, 1/2 |z - stop_gradient(z - g)|^2."""
+    """d/d clip of sum(stop_gradient(g) * latents(clip)), and of 1/2 |z - stop_gradient(z - g)|^2, g the gradient per frame."""
     prior = VideoPrior.load(write_tiny(tmp_path / "prior"))
     text, negative = prior.encode_prompt(["snow is falling", "no snow"]).split(1)
     config, clip = DistillationConfig(), torch.rand(9, 3, 32, 48, generator=seeded(4))
@@ -197,7 +203,7 @@ def test_gradient_on_the_clip_is_autograd_of_the_explicit_expression(tmp_path):
     (linear,) = torch.autograd.grad((on_latents.gradient * latents).sum(), pixels, retain_graph=True)
     rest = latents - (latents - on_latents.gradient).detach()
     (quadratic,) = torch.autograd.grad(0.5 * rest.square().sum(), pixels, retain_graph=True)
-    explicit_loss = (_noise_difference(prior, latents, text, negative, 400, seed=6).detach() * latents).sum()
+    explicit_loss = (_noise_difference(prior, latents, text, negative, 400, seed=6).detach() * latents).sum() / 9
     (textbook,) = torch.autograd.grad(explicit_loss, pixels, retain_graph=True)
     free = distill_clip(prior, clip, text, negative, 400, config=DistillationConfig(max_rms=math.inf), generator=seeded(6))
     assert float((free.gradient - textbook).norm() / textbook.norm()) < 1e-4

@@ -253,7 +253,7 @@ def _mode_row(variant: Variant, steps: int) -> Record:
         found = distill(prior, latents, NESTED, None, timestep, config=config, generator=rng, frames=9, progress=progress)
         drift = (latents - simulated).norm(dim=2).mean()
         optimizer.zero_grad()
-        weight = 0.1 * regularization_scale("adaptive", found.loss)
+        weight = 0.01 * regularization_scale("adaptive", found.loss)
         ((found.gradient.float() * latents).sum() + weight * drift).backward()
         optimizer.step()
         if step >= steps - counted:

@@ -2,24 +2,29 @@
 
 Every term is an L2 norm per Gaussian (not its square), averaged over the Gaussians and the frames of the clip. The norms are
 sqrt(x^2 + eps^2) - eps with eps = 1e-6: the same for all that matters, zero at zero, and with a finite gradient there.
+
+The paper's code takes mean squares instead ("squares"). A norm pulls with the same force near and far; a square hardly feels
+small offsets, and large ones all the more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.dynamics.look import Change, LearnedLook
+from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.dynamics.rollout import Begin, RolledFrame, Rollout
 
 EPSILON = 1e-6
 APPEARANCE = tuple(f"{state}_{name}" for state in ("active", "collided") for name in ("opacity", "scale", "rgb"))
+
+Form = Literal["norms", "squares"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +49,7 @@ class RegularizationWeights:
     """Change of the logarithm of the scales per frame, after landing."""
     collided_rgb: float = 35.0
     """Change of colour per frame, after landing."""
-    look: float = 0.01
+    look: float = 0.001
     """Shift of the look that all particles share; not in the paper, which regularizes changes from frame to frame only."""
     without: tuple[str, ...] = ()
     """Terms to leave out, by the names above; "app" names all six of the appearance per frame, as the paper's ablation does."""
@@ -52,10 +57,13 @@ class RegularizationWeights:
     """Terms whose weight stays as it is, whatever scales the others; the paper's study of drift holds xyz so."""
     times: float = 1.0
     """Factor on all terms; the paper's study of sensitivity tries 0.1 and 10, on one term at a time."""
+    form: Form = "norms"
+    """What is weighted: norms per particle, as the paper writes them, or squares, as its code has them (units squared; for
+    orientations the squared difference of the quaternions)."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a term to leave out does not exist, or the factor is negative."""
-        known = [f.name for f in fields(self) if f.name not in ("without", "constant", "times")]
+        known = [f.name for f in fields(self) if f.name not in ("without", "constant", "times", "form")]
         for what, names, known_here in (
             ("to leave out", self.without, [*known, "app"]),
             ("of constant weight", self.constant, known),
@@ -85,27 +93,46 @@ class RegularizationWeights:
         return torch.stack(used).sum() if used else torch.zeros_like(next(iter(terms.values())))
 
 
-def regularization(clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None) -> dict[str, Tensor]:
-    """The terms of one clip, named as in RegularizationWeights; zero where there is no particle."""
+def regularization(
+    clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None, form: Form = "norms"
+) -> dict[str, Tensor]:
+    """The terms of one clip, named and formed as in RegularizationWeights; zero where there is no particle."""
     stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
-    zero = clip[0].gaussians.means.new_zeros(())
-    mean = _Mean(zero)
+    mean = _Mean(clip[0].gaussians.means.new_zeros(()))
+    size, turn = (safe_norm, rotation_angle) if form == "norms" else (squared_norm, quaternion_difference)
     terms = {
-        "xyz": mean(safe_norm(rolled.offset) for rolled in clip),
-        "vel": mean(safe_norm(deltas.active.velocity) for deltas in stepped),
-        "rot": mean(rotation_angle(rolled.quats, rolled.simulated_quats) for rolled in clip),
-        **_appearance("active", [deltas.active.change for deltas in stepped], mean),
-        **_appearance("collided", [deltas.resting for deltas in stepped], mean),
+        "xyz": mean(size(rolled.offset) for rolled in clip),
+        "vel": mean(size(deltas.active.velocity) for deltas in stepped),
+        "rot": mean(turn(rolled.quats, rolled.simulated_quats) for rolled in clip),
     }
+    for state, changes in (
+        ("active", [deltas.active.change for deltas in stepped]),
+        ("collided", [deltas.resting for deltas in stepped]),
+    ):
+        terms[f"{state}_opacity"] = mean(size(change.opacity[:, None]) for change in changes)
+        terms[f"{state}_scale"] = mean(size(change.log_scale) for change in changes)
+        terms[f"{state}_rgb"] = mean(size(change.rgb) for change in changes)
     if learned_look is not None:
         shifts = learned_look.bounded()
-        terms["look"] = torch.stack([_size(shift).sum() for shift in shifts]).sum()
+        parts = [size(part).sum() for shift in shifts for part in (shift.opacity[:, None], shift.log_scale, shift.rgb)]
+        terms["look"] = torch.stack(parts).sum()
     return terms
 
 
 def safe_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
     """L2 norm per row; its gradient is finite everywhere and zero at zero."""
     return (x.square().sum(dim=1) + EPSILON**2).sqrt() - EPSILON
+
+
+def squared_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
+    """Squared L2 norm per row."""
+    return x.square().sum(dim=1)
+
+
+def quaternion_difference(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+    """|a - b|^2 of wxyz quaternions, of both signs of `a` the nearer: 2 - 2 |a . b|, for small angles angle^2 / 4."""
+    sign = torch.where((a * b).sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
+    return squared_norm(sign * a - b)
 
 
 def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
@@ -138,7 +165,7 @@ def gap(rollout: Rollout, windows: Sequence[tuple[int, int]], *, begin: Begin = 
     """Drift of training clips against that of the roll-out which is shown in the end, at the same frames.
 
     Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at
-    the roll-out start from kept states: with those of the present weights the gap is zero, else it is what stale ones cost.
+    the roll-out start where it leads: their gap is zero.
 
     Args:
         rollout: its kept states are left as they are.
@@ -162,18 +189,6 @@ def _distance(rolled: RolledFrame) -> float | None:
 def _average(distances: Iterable[float | None]) -> float:
     found = [distance for distance in distances if distance is not None]
     return sum(found) / len(found) if found else 0.0
-
-
-def _appearance(state: str, changes: Sequence[Change], mean: _Mean) -> dict[str, Tensor]:
-    return {
-        f"{state}_opacity": mean(safe_norm(change.opacity[:, None]) for change in changes),
-        f"{state}_scale": mean(safe_norm(change.log_scale) for change in changes),
-        f"{state}_rgb": mean(safe_norm(change.rgb) for change in changes),
-    }
-
-
-def _size(shift: Change) -> Float[Tensor, "1"]:
-    return safe_norm(shift.opacity[:, None]) + safe_norm(shift.log_scale) + safe_norm(shift.rgb)
 
 
 class _Mean:

@@ -1,14 +1,16 @@
 """The roll-out: from simulated motion, initial look and learned field to the Gaussians of any frame.
 
 Training windows start from states that the roll-out really reaches. (The paper's code restarts every training clip from
-simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) Rolling 250 frames for
-one clip would be waste, so `refresh` does it once in a while and keeps a state every `stride` frames.
+simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) What is in the air there
+is rolled from its birth with the present weights, since motion that is held by where it was some steps ago swings about where
+it should be. What lies has lain for longer and only changes its look: `refresh` rolls through everything once in a while
+and keeps a state every `stride` frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -197,7 +199,7 @@ class Rollout:
         with torch.no_grad():
             before = max(start - 1, 0)
             reached = begin == "rollout" and start > 0
-            state = self._reach(before, visible) if reached else simulated(self.history, before, visible)
+            state = self._under_way(before, visible) if reached else simulated(self.history, before, visible)
         look = self._learned()
         clip = [self._rendered(state, look, None)] if start == 0 else []
         for step in range(frames - len(clip)):
@@ -250,6 +252,25 @@ class Rollout:
         if visible is None:
             self._last = state
         return state
+
+    def _under_way(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
+        """The state from which a clip starts: what flies as the present weights have moved it since its birth, what lies as the
+        last `refresh` saw it."""
+        self._check(frame)
+        if self.field.still():
+            return simulated(self.history, frame, visible)
+        flying = self.history.active(frame)
+        if visible is not None:
+            flying = flying[visible[flying]]
+        aloft = torch.zeros(len(self.history), dtype=torch.bool, device=flying.device)
+        aloft[flying] = True
+        lying = self._reach(frame, ~aloft if visible is None else visible & ~aloft)
+        if len(flying) == 0:
+            return lying
+        state, look = simulated(self.history, int(self.history.births[flying].min()), aloft), self._learned()
+        while state.frame < frame:
+            state, _ = advance(state, self.history, look, self.field, aloft, self._flow)
+        return replace(state, resting=lying.resting, resting_change=lying.resting_change)
 
     def _check(self, frame: int) -> None:
         if not 0 <= frame < len(self):

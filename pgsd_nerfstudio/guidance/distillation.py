@@ -93,10 +93,11 @@ class Distilled(NamedTuple):
     """One evaluation of the video prior."""
 
     gradient: Float[Tensor, "1 lt c lh lw"]
-    """Of the loss with respect to the latents."""
+    """Of the loss with respect to the latents: omega (eps_hat - eps) / frames of the clip."""
     loss: float
-    """|L_SDS| = 1/2 sum(gradient^2) / frames of the clip, as in the paper's code: what SDS-adaptive weights are scaled by.
-    A magnitude, not a loss to differentiate: as in DreamFusion there is no true loss behind the gradient."""
+    """|L_SDS| = 1/2 sum((omega (eps_hat - eps))^2) / frames of the clip, as in the paper's code: what SDS-adaptive weights are
+    scaled by. With its target held fixed it has the gradient above, so that both are weighed against the other losses alike. A
+    magnitude, not a loss to lower: as in DreamFusion there is no true loss behind the gradient."""
     timestep: int
 
 
@@ -154,7 +155,7 @@ def distill(
     rms = float(gradient.double().square().mean().sqrt())
     if rms > config.max_rms:
         gradient = gradient * (config.max_rms / rms)
-    return Distilled(gradient, 0.5 * float(gradient.double().square().sum()) / frames, timestep)
+    return Distilled(gradient / frames, 0.5 * float(gradient.double().square().sum()) / frames, timestep)
 
 
 def distill_clip(

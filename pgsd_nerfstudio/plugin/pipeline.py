@@ -153,7 +153,7 @@ class WeatherPipeline(VanillaPipeline):
         with watch("render, backward"):
             video, norms = surrogate(stage, views, weather, background, moments, distilled.gradient)
         with watch("regularize"):
-            terms = regularization(rolled, model.look)
+            terms = regularization(rolled, model.look, options.regularization.form)
             scale = regularization_scale(options.weights, distilled.loss, step, options.training_steps)
             weights = options.regularization
             losses = weights.weighted(terms, scale)
