@@ -17,7 +17,7 @@ from pgsd_nerfstudio.dynamics import (
     RegularizationWeights,
     Rollout,
     drift,
-    gap,
+    gaps,
     regularization,
 )
 from pgsd_nerfstudio.dynamics.state import advance, simulated
@@ -237,23 +237,24 @@ def steady() -> Rollout:
 def test_gap_is_what_training_clips_do_not_see_of_a_steady_drift():
     """5 mm a frame: frame t of the roll-out has drifted by 5 t mm, frame k of a clip from the simulation by 5 (k + 1) mm."""
     roll = steady()
-    seen, shown, difference = gap(roll, [(10, 4), (31, 9)])
+    found = gaps(roll, [(10, 4), (31, 9)])
+    seen, shown, difference = found["simulation"]
     clips = [k + 1 for k in range(4)] + [k + 1 for k in range(9)]
     whole = [*range(10, 14), *range(31, 40)]
     assert seen == pytest.approx(0.005 * sum(clips) / 13, rel=1e-4)
     assert shown == pytest.approx(0.005 * sum(whole) / 13, rel=1e-4)
     assert difference == pytest.approx(shown - seen)
-    assert gap(roll, [(10, 4), (31, 9)], begin="rollout").difference == pytest.approx(0.0, abs=1e-6)
+    assert found["rollout"].difference == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_clip_starts_where_the_present_weights_have_led_what_flies_and_older_ones_what_lies():
-    """Kept states of 5 mm a frame, weights of now 10 mm: a clip that starts at frame 16 is 16 times 10 mm off, gap or no gap."""
+    """Kept states of 5 mm a frame, weights of now 10 mm: a clip that starts at frame 16 is 16 times 10 mm off."""
     roll = steady()
     roll.refresh()
     with torch.no_grad():
         roll.field.active_net.heads["velocity"].bias[0] = torch.atanh(torch.tensor(0.01 / roll.field.bounds.velocity))
     kept = dict(roll._keyframes)
-    assert gap(roll, [(16, 1)], begin="rollout") == (pytest.approx(0.16, rel=1e-4), pytest.approx(0.16, rel=1e-4), 0.0)
+    assert gaps(roll, [(16, 1)])["rollout"] == (pytest.approx(0.16, rel=1e-4), pytest.approx(0.16, rel=1e-4), 0.0)
     assert roll.stale and roll._keyframes == kept
 
     roll = rollout(falling(), weights=0.3)
@@ -272,8 +273,8 @@ def test_a_clip_starts_where_the_present_weights_have_led_what_flies_and_older_o
 
 
 def test_gap_is_zero_untrained_and_without_clips():
-    assert gap(rollout(falling()), [(0, 9), (20, 9)]) == (0.0, 0.0, 0.0)
-    assert gap(rollout(falling(), weights=0.1), []) == (0.0, 0.0, 0.0)
+    assert gaps(rollout(falling()), [(0, 9), (20, 9)])["simulation"] == (0.0, 0.0, 0.0)
+    assert gaps(rollout(falling(), weights=0.1), [])["simulation"] == (0.0, 0.0, 0.0)
 
 
 def test_frames_afresh_are_those_of_a_roll_out_that_has_kept_nothing():

@@ -51,7 +51,9 @@ def test_quaternion_difference_is_that_of_the_nearer_sign_and_a_quarter_of_the_s
     slightly = roma.quat_xyzw_to_wxyz(
         roma.quat_product(roma.quat_wxyz_to_xyzw(a), roma.rotvec_to_unitquat(0.01 * torch.randn(200, 3, dtype=torch.float64)))
     )
-    torch.testing.assert_close(quaternion_difference(slightly, a), rotation_angle(slightly, a).square() / 4, rtol=1e-3, atol=1e-8)
+    torch.testing.assert_close(
+        quaternion_difference(slightly, a), rotation_angle(slightly, a).square() / 4, rtol=1e-3, atol=1e-8
+    )
 
 
 def test_norm_is_the_norm_and_smooth_at_zero():

@@ -23,6 +23,8 @@ from pgsd_nerfstudio.weather import SNOWFALL, initial_look
 
 FRAMES, WIDTH, HEIGHT = 9, 96, 64
 START = 30
+IN_THE_AIR = 20_000
+TARGET = "<= 2.5"  # s, of a training step on two cores
 
 
 def verify(quick: bool) -> list[Record]:
@@ -41,38 +43,57 @@ def verify(quick: bool) -> list[Record]:
 
 
 def bench(quick: bool) -> list[Record]:
-    """Seconds of a training step by stage, as ns-train runs it with its defaults."""
+    """Seconds of a training step by stage, as ns-train runs it, with 20,000 flakes in the air and a field that moves them."""
     try:
         pipeline = _pipeline()
     except RunError as error:
         return [Record("training step", None, "s", source=f"not measurable here: {error}")]
     stages: dict[str, list[float]] = {}
-    for step in range(1, 3 if quick else 6):
-        for name, seconds in _step(pipeline, step).items():
+    aloft, seen, options, history = [], [], pipeline.config.options, pipeline.model.history
+    for step in range(0, 3 if quick else 8):
+        found, frame, particles = _step(pipeline, step)
+        for name, seconds in found.items():
             stages.setdefault(name, []).append(seconds)
+        aloft.append(len(history.active(frame)))
+        seen.append(particles)
+    refresh = stages.pop("refresh")[0]
+    stages["refresh, its share"] = [refresh / options.refresh_every]
     error = _gradient_error(pipeline.model.stage, _rollout(300))
-    options, history = pipeline.config.options, pipeline.model.history
     source = (
-        f"demo, {len(history):,} particles, {options.clip_frames} frames of {options.clip_width}x{options.clip_height}, "
-        f"{options.prior} prior, median of {len(stages['whole step'])} steps"
+        f"demo, {statistics.mean(aloft):,.0f} particles in the air, {statistics.mean(seen):,.0f} seen by the clip, "
+        f"{options.clip_frames} frames of {options.clip_width}x{options.clip_height}, {options.prior} prior, median of "
+        f"{len(stages['whole step']) - 1} steps, a refresh of {refresh:.2g} s every {options.refresh_every}"
     )
     paid = {"error": error, "error_unit": "relative L2 of the gradient", "source": source}
-    return [Record(f"training step: {name}", statistics.median(each), "s", **paid) for name, each in stages.items()]
+    # The first step prepares things for the first time.
+    median = {name: statistics.median(each[1:] or each) for name, each in stages.items()}
+    whole = median.pop("whole step") + median["refresh, its share"]
+    return [
+        *(Record(f"training step: {name}", seconds, "s", **paid) for name, seconds in median.items()),
+        Record.judged("training step: whole step", whole, "s", TARGET, **paid),
+    ]
 
 
 def _pipeline() -> Any:
-    """A pipeline under training, as the Trainer makes it, of two seconds of weather."""
+    """A pipeline under training, as the Trainer makes it, whose field has learned something."""
     from torch.amp.grad_scaler import GradScaler
 
     from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
 
     torch.manual_seed(0)
-    config = WeatherTrainerConfig(load_scene=Path("demo"), seconds=2.0)
+    config = WeatherTrainerConfig(load_scene=Path("demo"), max_particles=IN_THE_AIR)
     device = config.machine.device_type
-    return config.pipeline.setup(device=device, test_mode="val", grad_scaler=GradScaler(device, enabled=False))
+    pipeline = config.pipeline.setup(device=device, test_mode="val", grad_scaler=GradScaler(device, enabled=False))
+    with torch.no_grad():
+        for head in pipeline.model.rollout.field.heads():
+            for parameter in head.parameters():
+                parameter += 1e-3 * torch.randn_like(parameter)
+    return pipeline
 
 
-def _step(pipeline: Any, step: int) -> dict[str, float]:
+def _step(pipeline: Any, step: int) -> tuple[dict[str, float], int, int]:
+    """Seconds by stage, the first frame of the clip and how many particles it sees."""
+    start = int(pipeline.datamanager.next_train(step)[1]["start"])
     began = time.perf_counter()
     _, losses, metrics = pipeline.get_train_loss_dict(step)
     before = time.perf_counter()
@@ -81,7 +102,8 @@ def _step(pipeline: Any, step: int) -> dict[str, float]:
     for parameter in pipeline.parameters():
         parameter.grad = None
     stages = {name.removeprefix("seconds/"): float(value) for name, value in metrics.items() if name.startswith("seconds/")}
-    return {**stages, "roll-out, backward": end - before, "whole step": end - began}
+    whole = end - began - stages.get("refresh", 0.0)
+    return {**stages, "roll-out, backward": end - before, "whole step": whole}, start, int(metrics["particles_seen"])
 
 
 def _rollout(most: int) -> Rollout:

@@ -1,10 +1,12 @@
 """LEARNED: the neural dynamics field, rolled out over time from the simulated motion."""
 
 from pgsd_nerfstudio.dynamics.deformation import Deformation, DeformationConfig, DeformedCloud, scattered
+from pgsd_nerfstudio.dynamics.drift import Gap, drift, gaps
 from pgsd_nerfstudio.dynamics.field import DeltaBounds, DynamicsField, FieldConfig
 from pgsd_nerfstudio.dynamics.look import LearnedLook
-from pgsd_nerfstudio.dynamics.regularizers import Gap, RegularizationWeights, drift, gap, regularization
-from pgsd_nerfstudio.dynamics.rollout import Begin, Motion, RolledFrame, Rollout
+from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights, regularization
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame
+from pgsd_nerfstudio.dynamics.rollout import Begin, Motion, Rollout
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 
 __all__ = [
@@ -23,7 +25,7 @@ __all__ = [
     "Rollout",
     "VelocityField",
     "drift",
-    "gap",
+    "gaps",
     "regularization",
     "scattered",
 ]

@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
-from pgsd_nerfstudio.dynamics.rollout import Begin, Progress, RolledFrame, check_finite
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite
+from pgsd_nerfstudio.dynamics.rollout import Begin, Progress
 from pgsd_nerfstudio.dynamics.state import Deltas, turned
 from pgsd_nerfstudio.physics.history import ParticleHistory
 from pgsd_nerfstudio.scene.gaussians import Gaussians

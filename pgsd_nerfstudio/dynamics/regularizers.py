@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import roma
 import torch
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.look import LearnedLook
-from pgsd_nerfstudio.dynamics.rollout import Begin, RolledFrame, Rollout
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame
 
 EPSILON = 1e-6
 APPEARANCE = tuple(f"{state}_{name}" for state in ("active", "collided") for name in ("opacity", "scale", "rgb"))
@@ -142,53 +142,6 @@ def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Te
     """
     between = roma.quat_product(roma.quat_conjugation(roma.quat_wxyz_to_xyzw(b)), roma.quat_wxyz_to_xyzw(a))
     return 2 * torch.atan2(safe_norm(between[:, :3]), between[:, 3].abs())
-
-
-def drift(frames: Iterable[RolledFrame]) -> float:
-    """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
-    return _average(_distance(rolled) for rolled in frames)
-
-
-class Gap(NamedTuple):
-    """How far clips are from what they are cut from; metres."""
-
-    clips: float
-    """Drift of the clips as training sees them."""
-    rollout: float
-    """Drift of the whole roll-out with the present weights, at the same frames."""
-    difference: float
-    """The second minus the first: the drift that training does not see."""
-
-
-@torch.no_grad()
-def gap(rollout: Rollout, windows: Sequence[tuple[int, int]], *, begin: Begin = "simulation") -> Gap:
-    """Drift of training clips against that of the roll-out which is shown in the end, at the same frames.
-
-    Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at
-    the roll-out start where it leads: their gap is zero.
-
-    Args:
-        rollout: its kept states are left as they are.
-        windows: (first frame, number of frames) of each clip.
-        begin: where the clips start from.
-
-    Raises:
-        IndexError: a clip leaves the sequence.
-    """
-    clips = [rolled for start, frames in windows for rolled in rollout.window(start, frames, begin=begin)]
-    whole = {rolled.frame: _distance(rolled) for rolled in rollout.afresh({rolled.frame for rolled in clips})}
-    seen, shown = _average(_distance(rolled) for rolled in clips), _average(whole[rolled.frame] for rolled in clips)
-    return Gap(seen, shown, shown - seen)
-
-
-def _distance(rolled: RolledFrame) -> float | None:
-    """Mean distance in metres of one frame; None where no particle is in the air."""
-    return float(rolled.offset.detach().norm(dim=1).mean()) if len(rolled.active) else None
-
-
-def _average(distances: Iterable[float | None]) -> float:
-    found = [distance for distance in distances if distance is not None]
-    return sum(found) / len(found) if found else 0.0
 
 
 class _Mean:

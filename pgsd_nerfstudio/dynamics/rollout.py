@@ -1,25 +1,26 @@
 """The roll-out: from simulated motion, initial look and learned field to the Gaussians of any frame.
 
 Training windows start from states that the roll-out really reaches. (The paper's code restarts every training clip from
-simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) What is in the air there
-is rolled from its birth with the present weights, since motion that is held by where it was some steps ago swings about where
-it should be. What lies has lain for longer and only changes its look: `refresh` rolls through everything once in a while
+simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) What is in the air
+there is rolled from its birth with the present weights, since motion that is held by where it was some steps ago swings about
+where it should be. What lies has lain for longer and only changes its look: `refresh` rolls through everything once in a while
 and keeps a state every `stride` frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite
 from pgsd_nerfstudio.dynamics.state import Deltas, State, advance, fading, simulated
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.physics.history import ParticleHistory
@@ -29,26 +30,6 @@ from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 Progress = Callable[[int, int], None]
 Begin = Literal["rollout", "simulation"]
 Motion = Literal["particle", "field"]
-
-
-@dataclass(frozen=True)
-class RolledFrame:
-    """One frame of a roll-out: what to render, and what to regularize."""
-
-    frame: int
-    gaussians: Gaussians
-    """In metres, plain RGB: the active ones, then the collided ones."""
-    active: Int[Tensor, "n"]
-    """Ids of the first n Gaussians."""
-    resting: Int[Tensor, "m"]
-    """Ids of the other m."""
-    offset: Float[Tensor, "n 3"]
-    """Rendered minus simulated position, metres."""
-    quats: Float[Tensor, "n 4"]
-    """Rendered orientation, wxyz."""
-    simulated_quats: Float[Tensor, "n 4"]
-    deltas: Deltas | None
-    """What the field added in this frame; None in a roll-out without gradient."""
 
 
 class Rollout:
@@ -305,11 +286,3 @@ class Rollout:
 
 def _fields(look: ParticleLook) -> tuple[Tensor, Tensor, Tensor]:
     return look.opacity, look.scales, look.rgb
-
-
-def check_finite(rolled: RolledFrame) -> None:
-    """Raises FloatingPointError: a Gaussian is not finite; the message names quantity and frame."""
-    try:
-        rolled.gaussians.check_finite()
-    except ValueError as error:
-        raise FloatingPointError(f"frame {rolled.frame} of the roll-out: {error}") from error

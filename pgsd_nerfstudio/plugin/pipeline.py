@@ -21,7 +21,7 @@ from nerfstudio.utils import writer
 from rich.console import Console
 from torch import Tensor
 
-from pgsd_nerfstudio.dynamics import drift, regularization
+from pgsd_nerfstudio.dynamics import Begin, Gap, Rollout, drift, gaps, regularization
 from pgsd_nerfstudio.guidance.distillation import DistilledClip
 from pgsd_nerfstudio.guidance.schedules import regularization_scale
 from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surrogate
@@ -34,6 +34,7 @@ from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.summary import print_summary
 
+GAP_CLIPS = 4  # clips, which training does not see, that the drift is compared on
 MAX_SKIPPED = 2  # steps in a row that may pass without a gradient; one more ends the run
 
 console = Console(stderr=True, highlight=False)
@@ -197,6 +198,14 @@ class WeatherPipeline(VanillaPipeline):
         start, frames = int(batch["start"]), self.config.options.clip_frames or 1
         metres = drift(self.model.rollout.frames(start, start + frames))
         return {}, {"drift_m": torch.tensor(metres)}, {}
+
+    def drift_gaps(self) -> dict[Begin, Gap]:
+        """Drift of clips, begun in either way, against that of the whole roll-out; {} where there is no simulation."""
+        rollout = self.model.rollout
+        if not isinstance(rollout, Rollout):
+            return {}
+        starts = [int(self.datamanager.next_eval(index)[1]["start"]) for index in range(GAP_CLIPS)]
+        return gaps(rollout, [(start, self.config.options.clip_frames or 1) for start in starts])
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """After each step the norms of its gradients go to the log."""

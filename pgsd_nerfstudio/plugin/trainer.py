@@ -6,11 +6,14 @@ from dataclasses import fields
 from typing import Any, Literal
 
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
+
+NAMES = {"simulation": "simulation", "rollout": "roll-out"}
 
 
 class WeatherTrainer(Trainer):
@@ -56,6 +59,14 @@ class WeatherTrainer(Trainer):
             raise
         config = self.config.get_base_dir() / "config.yml"
         stage: Any = self.pipeline.model.stage
+        for begin, gap in self.pipeline.drift_gaps().items():
+            writer.put_scalar(f"gap/{begin}_m", gap.difference, self.config.max_num_iterations)
+            CONSOLE.print(
+                f"Drift of clips that begin at the {NAMES[begin]}: {1000 * gap.clips:.2f} mm, of the whole video at the same "
+                f"frames {1000 * gap.rollout:.2f} mm: unseen {1000 * gap.difference:.2f} mm",
+                soft_wrap=True,
+            )
+        writer.write_out_storage()
         CONSOLE.print(f"Frozen scene while training: {stage.clip_rasterizer.memory}", soft_wrap=True)
         CONSOLE.print(f"Look at it: ns-viewer --load-config {config}", soft_wrap=True)
         CONSOLE.print(f"A video: ns-render interpolate --load-config {config} --output-path snow.mp4", soft_wrap=True)

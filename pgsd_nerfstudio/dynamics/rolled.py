@@ -1,0 +1,39 @@
+"""One frame of a roll-out: what is handed on to rendering and regularization."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics.state import Deltas
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class RolledFrame:
+    """One frame of a roll-out: what to render, and what to regularize."""
+
+    frame: int
+    gaussians: Gaussians
+    """In metres, plain RGB: the active ones, then the collided ones."""
+    active: Int[Tensor, "n"]
+    """Ids of the first n Gaussians."""
+    resting: Int[Tensor, "m"]
+    """Ids of the other m."""
+    offset: Float[Tensor, "n 3"]
+    """Rendered minus simulated position, metres."""
+    quats: Float[Tensor, "n 4"]
+    """Rendered orientation, wxyz."""
+    simulated_quats: Float[Tensor, "n 4"]
+    deltas: Deltas | None
+    """What the field added in this frame; None in a roll-out without gradient."""
+
+
+def check_finite(rolled: RolledFrame) -> None:
+    """Raises FloatingPointError: a Gaussian is not finite; the message names quantity and frame."""
+    try:
+        rolled.gaussians.check_finite()
+    except ValueError as error:
+        raise FloatingPointError(f"frame {rolled.frame} of the roll-out: {error}") from error
