@@ -76,6 +76,18 @@ def test_a_window_is_dense(history):
     assert window.positions[:, :, 0].tolist() == [[3, 3, 3], [10, 10, 12]]
 
 
+def test_selected_particles_keep_what_is_theirs(history):
+    ids = torch.tensor([len(history) - 1, 0])
+    few = history.select(ids)
+    assert (few.frames, few.fps, len(few)) == (history.frames, history.fps, 2)
+    for new, old in enumerate(ids.tolist()):
+        assert int(few.births[new]) == int(history.births[old]) and bool(few.collided[new]) == bool(history.collided[old])
+        for frame in range(int(history.births[old]), int(history.ends[old])):
+            there, here = few.positions_at(frame, torch.tensor([new])), history.positions_at(frame, torch.tensor([old]))
+            assert torch.equal(there, here)
+    assert len(history.select(ids[:0])) == 0
+
+
 def test_saved_and_loaded_it_is_the_same(history, tmp_path):
     history.save(tmp_path / "h.safetensors")
     again = ParticleHistory.load(tmp_path / "h.safetensors")

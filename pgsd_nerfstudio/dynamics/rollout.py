@@ -248,10 +248,11 @@ class Rollout:
         lying = self._reach(frame, ~aloft if visible is None else visible & ~aloft)
         if len(flying) == 0:
             return lying
-        state, look = simulated(self.history, int(self.history.births[flying].min()), aloft), self._learned()
+        few, look = self.history.select(flying), self._learned().select(flying)
+        state = simulated(few, int(few.births.min()))
         while state.frame < frame:
-            state, _ = advance(state, self.history, look, self.field, aloft, self._flow)
-        return replace(state, resting=lying.resting, resting_change=lying.resting_change)
+            state, _ = advance(state, few, look, self.field, None, self._flow)
+        return replace(state, active=flying, resting=lying.resting, resting_change=lying.resting_change)
 
     def _check(self, frame: int) -> None:
         if not 0 <= frame < len(self):

@@ -117,6 +117,15 @@ class ParticleHistory:
         rows = self.offsets[ids][:, None] + (torch.minimum(torch.maximum(at, born), ended - 1) - born)
         return Window(ids, self.positions[rows], (born <= at) & (at < ended))
 
+    def select(self, ids: Int[Tensor, "n"]) -> ParticleHistory:
+        """The history of these particles alone, in this order; their ids there are 0 .. n - 1."""
+        first, lengths = self.offsets[ids], self.offsets[ids + 1] - self.offsets[ids]
+        offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+        total = int(offsets[-1])
+        rows = (first - offsets[:-1]).repeat_interleave(lengths) + torch.arange(total, device=self.device)
+        every = {name: getattr(self, name)[ids] for name in _TENSORS if name not in ("offsets", "positions")}
+        return replace(self, **every, offsets=offsets, positions=self.positions[rows])
+
     def to(self, device: torch.device | str) -> ParticleHistory:
         return replace(self, **{name: getattr(self, name).to(device) for name in _TENSORS})
 

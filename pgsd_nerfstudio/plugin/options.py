@@ -114,7 +114,8 @@ class WeatherOptions(Knobs, SceneOptions):
     at a small error (64 for 96x64 pixels, 16 for larger ones). The error, larger where weather lies on surfaces than where it
     flies, is printed with the first clip; by default exact."""
     refresh_every: int = 50
-    """Steps between roll-outs of the whole weather, from whose states the training clips start; in between they age."""
+    """Steps between roll-outs of the whole weather, which keep the look of what lies for the clips in between; what flies is
+    always where the present weights lead it."""
     clip_every: int = 20
     """Steps between training clips that go to the log as pictures, their frames side by side (--vis tensorboard); 0: never."""
     clip_frames: int | None = None

@@ -62,6 +62,9 @@ class InitialLook:
     collided: ParticleLook
     settle_seconds: float
 
+    def select(self, ids: Int[Tensor, "n"]) -> InitialLook:
+        return InitialLook(self.active.select(ids), self.collided.select(ids), self.settle_seconds)
+
     def to(self, device: torch.device | str) -> InitialLook:
         return InitialLook(self.active.to(device), self.collided.to(device), self.settle_seconds)
 
