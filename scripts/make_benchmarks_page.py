@@ -23,16 +23,19 @@ column: nothing was promised, or it cannot be measured on the machine (the reaso
 
 
 def page(files: list[Path]) -> str:
-    """The whole page from files of records."""
+    """The whole page from files of records, each with the remarks in the .md of its name, if there is one."""
     parts = [HEAD]
-    rows = [row for path in files for row in read_records(path)]
-    for run, group in groupby(rows, key=lambda row: split_source(row.source)[1]):
-        command, _, machine = run.partition(" on ")
-        rows_here = list(group)
-        body = table(rows_here)
-        if len(rows_here) > LONG:
-            body = f"<details><summary>{len(rows_here)} rows</summary>\n\n{body}\n</details>\n"
-        parts.append(f"## `{command}`\n\n{machine}\n\n{body}")
+    for path in files:
+        for run, group in groupby(read_records(path), key=lambda row: split_source(row.source)[1]):
+            command, _, machine = run.partition(" on ")
+            rows_here = list(group)
+            body = table(rows_here)
+            if len(rows_here) > LONG:
+                body = f"<details><summary>{len(rows_here)} rows</summary>\n\n{body}\n</details>\n"
+            parts.append(f"## `{command}`\n\n{machine}\n\n{body}")
+        remarks = path.with_suffix(".md")
+        if remarks.exists():
+            parts.append(remarks.read_text())
     return "\n".join(parts)
 
 
