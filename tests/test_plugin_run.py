@@ -402,3 +402,16 @@ def copied(run: Path, tmp_path: Path) -> Path:
     loaded.output_dir = folder.parents[2]
     config.write_text(yaml.dump(loaded))
     return config
+
+
+def test_a_training_says_how_much_drift_its_clips_do_not_see(prior, tmp_path, capsys):
+    config = train(tiny_config(write_scene(tmp_path), prior, tmp_path / "outputs", lr=0.05))
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Drift of clips")]
+    found = opened(config).drift_gaps()
+    assert len(lines) == 2 and list(found) == ["simulation", "rollout"]
+    for line, name, gap in zip(lines, ("simulation", "roll-out"), found.values(), strict=True):
+        numbers = (f"{1000 * value:.2f} mm" for value in (gap.clips, gap.rollout, gap.difference))
+        assert line == "Drift of clips that begin at the {}: {}, of the whole video at the same frames {}: unseen {}".format(
+            name, *numbers
+        )
+    assert found["simulation"].difference > 1e-4 and found["rollout"].difference == pytest.approx(0.0, abs=1e-6)
