@@ -11,8 +11,9 @@ import pytest
 import roma
 import torch
 
+from pgsd_nerfstudio.response.rays import open_sky, ray_starts
 from pgsd_nerfstudio.response.sun_search import FEWEST
-from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor, sky_seen
+from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.courtyard.baking import SUN, SUN_LIGHT, sky_light
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
@@ -176,7 +177,8 @@ def test_an_overcast_courtyard_has_no_sun(courtyard):
 
 def test_open_ground_and_walls_see_their_halves_of_the_sky():
     yard = box_on_plane(1.0, toward(40, 0), count=2000)
-    seen = sky_seen(yard.points, yard.normals, yard.surface, rays=256)
+    starts = ray_starts(yard.points, yard.normals, yard.surface)
+    seen = open_sky(starts, yard.normals, yard.surface, 256, torch.Generator().manual_seed(0))[0]
     far = (yard.points[:, 2] == 0) & (yard.points[:, :2].norm(dim=1) > 2.2)
     wall, top = yard.normals[:, 2] == 0, yard.points[:, 2] > 1.199
     assert seen[far].min() > 0.9 and seen[top].min() == 1

@@ -23,9 +23,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pgsd_nerfstudio.response.rays import cosine_directions, frames, open_cosines, open_sky, ray_starts
+from pgsd_nerfstudio.response.rays import cosine_directions, frames, open_cosines, ray_starts
 from pgsd_nerfstudio.response.sun_search import (
-    SKY_RAYS,
     STRONGEST,
     bounded_loss,
     fitted,
@@ -110,19 +109,11 @@ def lit(sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3
     return cosines.mean(1).to(points)
 
 
-def sky_seen(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], surface: SurfaceMesh, *, rays: int = SKY_RAYS, seed: int = 0
-) -> Float[Tensor, "n"]:
-    """Cosine-weighted share of the hemisphere about each normal that is open sky, 0..1: open level ground has 1, a wall 1/2."""
-    place, normals = ray_starts(points, normals, surface), normals.detach().float().cpu()
-    return open_sky(place, normals, surface, rays, torch.Generator().manual_seed(seed))[0].to(points)
-
-
 def overcast_factor(sun: Sunlight, lit: Float[Tensor, "n"], sky_seen: Float[Tensor, "n"], clouds: float) -> Float[Tensor, "n"]:
     """What linear light is multiplied with when `clouds` (0..1) of the direct sun reach the ground as sky light instead.
 
-    Open level ground keeps its light, and so does what surfaces throw at each other; `lit` and `sky_seen` as the functions of
-    these names return them.
+    Open level ground keeps its light, and so does what surfaces throw at each other; `lit` as the function of this
+    name returns it, `sky_seen` as in Exposure.sky.
 
     Raises:
         ValueError: clouds are not within 0..1.
