@@ -128,9 +128,11 @@ def advance(
 
     laid = history.ends[fresh.resting] < frame
     rest = fresh.resting[laid]
-    lying = changed(look.collided_at(history, state.frame, rest), state.resting_change)
-    resting_delta = field.collided(history.rest_positions[rest], frame, lying)
-    resting = accumulate(look.collided_at(history, frame, rest), state.resting_change, resting_delta)
+    resting = resting_delta = state.resting_change
+    if len(rest):
+        lying = changed(look.collided_at(history, state.frame, rest), state.resting_change)
+        resting_delta = field.collided(history.rest_positions[rest], frame, lying)
+        resting = accumulate(look.collided_at(history, frame, rest), state.resting_change, resting_delta)
 
     return State(
         frame,
