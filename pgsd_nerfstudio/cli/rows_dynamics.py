@@ -81,7 +81,7 @@ def bench(quick: bool) -> list[Record]:
     error = _float_error(roll)
     unit = {"error": error, "error_unit": "m, float32 against float64 over the sequence"}
     untrained = rollout(history, weights=0.0)
-    frame = best(lambda: roll.window(start, 1), 4)
+    frame = best(lambda: roll.window(start, 1, begin="simulation"), 4)
     clip = best(lambda: _train(roll, start), 4)
     shown = best(lambda: untrained.gaussians(start), 4)
     per_particle = 1e6 / count

@@ -83,7 +83,10 @@ class StateNet(nn.Module):
         k = own.shape[1]
         constant = linear(shared, self.first.weight[:, k:], self.first.bias)
         hidden = torch.relu(self.second(torch.relu(linear(own, self.first.weight[:, :k]) + constant)))
-        return {name: torch.tanh(head(hidden)) for name, head in self.heads.items()}
+        # All heads in one product: each by itself is too narrow to be worth its call.
+        weight, bias = (torch.cat([getattr(head, part) for head in self.heads.values()]) for part in ("weight", "bias"))
+        out = torch.tanh(linear(hidden, weight, bias))
+        return dict(zip(self.heads, out.split([head.out_features for head in self.heads.values()], dim=1), strict=True))
 
 
 class DynamicsField(nn.Module):

@@ -95,6 +95,8 @@ def _shifted(look: ParticleLook, raw: Float[Tensor, "7"]) -> ParticleLook:
 
 def clamp(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
     """Clamp whose gradient vanishes only for a descent that would lead further out: what has saturated can come back."""
+    if not torch.is_grad_enabled():
+        return torch.clamp(x, low, high)  # type: ignore[arg-type]
     return _Clamp.apply(x, low, high)  # type: ignore[return-value]
 
 

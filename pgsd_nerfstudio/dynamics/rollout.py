@@ -42,7 +42,7 @@ class Rollout:
         field: DynamicsField,
         learned_look: LearnedLook | None = None,
         *,
-        stride: int = 25,
+        stride: int = 12,
         exposure: float = 0.0,
         motion: Motion = "particle",
     ) -> None:

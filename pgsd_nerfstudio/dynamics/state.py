@@ -115,8 +115,10 @@ def advance(
     # Ids ascend in both states, so those who stay stand in the same order here and there.
     stay, stayed = history.births[ids] < frame, history.ends[state.active] > frame
     ids = ids[stay]
-    change = Change(*(x[stayed] for x in state.active_change))
-    offset, quats = state.offset[stayed], state.quats[stayed]
+    change, offset, quats = state.active_change, state.offset, state.quats
+    if not bool(stayed.all()):
+        kept = stayed.nonzero()[:, 0]
+        change, offset, quats = Change(*(x[kept] for x in change)), offset[kept], quats[kept]
     fade = fading(history, state.frame, ids)
     before, now = history.positions_at(state.frame, ids), history.positions_at(frame, ids)
     here, motion = before + offset * fade[:, None], now - before

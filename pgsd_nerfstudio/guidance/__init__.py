@@ -6,6 +6,7 @@ from pgsd_nerfstudio.guidance.prior import VideoPrior
 from pgsd_nerfstudio.guidance.prompts import Prompts, embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, WeightDecay, Weighting, regularization_scale
 from pgsd_nerfstudio.guidance.variants import Embeddings, Omega, Role, Variant, roles_of
+from pgsd_nerfstudio.guidance.wan import WanPrior
 
 __all__ = [
     "DistillationConfig",
@@ -19,6 +20,7 @@ __all__ = [
     "TimestepSchedule",
     "Variant",
     "VideoPrior",
+    "WanPrior",
     "WeightDecay",
     "Weighting",
     "distill",

@@ -1,4 +1,4 @@
-"""Where a video prior lies: a diffusers folder of a CogVideoX text-to-video model, on this disk or on the Hugging Face hub.
+"""Where a video prior lies: a diffusers folder of a text-to-video model, on this disk or on the Hugging Face hub.
 
 Everything is judged before any weight is read, so that a wrong path costs one sentence and no minutes.
 """
@@ -38,16 +38,23 @@ def find_prior(place: str | Path) -> Path:
     Raises:
         PriorError: there is no such folder or model, or it is not a complete CogVideoX text-to-video model.
     """
+    folder = find_folder(place)
+    _judge(folder)
+    return folder
+
+
+def find_folder(place: str | Path) -> Path:
+    """The same, whatever is in it: of CogVideoX, of another family, or of no video prior at all.
+
+    Raises:
+        PriorError: there is no such folder or model.
+    """
     if str(place) == "bundled":
         if not (BUNDLED / "transformer").is_dir():
             raise PriorError("the bundled video prior has no weights: make them with `python scripts/train_bundled_prior.py`")
-        folder = BUNDLED
-    else:
-        folder = Path(place).expanduser()
-        if not folder.exists():
-            folder = _download(str(place))
-    _judge(folder)
-    return folder
+        return BUNDLED
+    folder = Path(place).expanduser()
+    return folder if folder.exists() else _download(str(place))
 
 
 def fingerprint(folder: Path) -> str:
@@ -84,13 +91,15 @@ def read_config(folder: Path, part: str) -> dict[str, Any]:
     try:
         return json.loads(path.read_text())
     except (OSError, json.JSONDecodeError) as error:
-        raise PriorError(f"a CogVideoX folder has {part}/{path.name}, but {path} could not be read: {error}") from error
+        raise PriorError(f"a diffusers folder has {part}/{path.name}, but {path} could not be read: {error}") from error
 
 
 def _download(name: str) -> Path:
     missing = f"there is no local folder {name}"
     if not HUB_ID.fullmatch(name):
-        raise PriorError(f"{missing}; give a diffusers CogVideoX folder, a hub id such as THUDM/CogVideoX-2b, or `bundled`")
+        raise PriorError(
+            f"{missing}; give a diffusers CogVideoX folder or Wan folder, a hub id such as THUDM/CogVideoX-2b, or `bundled`"
+        )
     from huggingface_hub import snapshot_download
 
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +21,9 @@ from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_t
 
 class PromptEncoder:
     """Text embeddings of one prior, remembered in memory and on disk."""
+
+    encoder_class = "T5EncoderModel"
+    """Name of the text encoder's class in transformers."""
 
     def __init__(self, folder: Path, length: int, device: torch.device, dtype: torch.dtype) -> None:
         """`length` tokens per text (the transformer's max_text_seq_length); texts are padded or cut to it."""
@@ -47,16 +51,16 @@ class PromptEncoder:
     def _encode(self, texts: list[str]) -> list[Tensor]:
         if not texts:
             return []
-        from transformers import T5EncoderModel
+        import transformers
 
         try:
-            # As in diffusers' pipeline: padded to full length, and the padding attends and is attended to.
             ids = token_ids(self._folder / "tokenizer", texts, self._length)
-            encoder = T5EncoderModel.from_pretrained(self._folder / "text_encoder", dtype=self._dtype, local_files_only=True)
+            kind = getattr(transformers, self.encoder_class)
+            encoder = kind.from_pretrained(self._folder / "text_encoder", dtype=self._dtype, local_files_only=True)
         except Exception as error:
             raise PriorError(f"the text encoder in {self._folder} could not be loaded: {error}") from error
         torch.nn.Module.to(encoder, self._device).eval()
-        embeddings = [encoder(row[None].to(self._device))[0][0].cpu() for row in ids]
+        embeddings = [self._embedding(encoder, row.to(self._device)).cpu() for row in ids]
         del encoder
         gc.collect()
         if self._device.type == "cuda":
@@ -67,6 +71,10 @@ class PromptEncoder:
                 f"the text encoder gave NaN or infinity for {bad[0]!r} in {self._dtype}; use a wider dtype, e.g. float32"
             )
         return embeddings
+
+    def _embedding(self, encoder: Any, ids: Int[Tensor, "l"]) -> Float[Tensor, "l d"]:
+        """As in CogVideoX' pipeline: padded to full length, and the padding attends and is attended to."""
+        return encoder(ids[None])[0][0]
 
 
 def token_ids(folder: Path, texts: Sequence[str], length: int) -> Int[Tensor, "n l"]:

@@ -11,12 +11,14 @@ from rich.console import Console
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, DistilledClip, distill_clip
-from pgsd_nerfstudio.guidance.folder import find_prior, read_config
+from pgsd_nerfstudio.guidance.folder import find_folder, find_prior, read_config
 from pgsd_nerfstudio.guidance.prior import VideoPrior
 from pgsd_nerfstudio.guidance.prompts import embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
 from pgsd_nerfstudio.guidance.variants import Embeddings
+from pgsd_nerfstudio.guidance.wan import WanPrior
+from pgsd_nerfstudio.guidance.wan_parts import find_wan, is_wan
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 
@@ -79,8 +81,10 @@ def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[Vid
         RunError: the prior cannot be used, or the weather is shorter than a clip.
     """
     try:
-        native = int(read_config(find_prior(options.prior), "transformer").get("sample_frames", PAPER_FRAMES))
-        prior = VideoPrior.load(options.prior, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
+        folder = find_folder(options.prior)
+        kind, judged = (WanPrior, find_wan) if is_wan(folder) else (VideoPrior, find_prior)
+        native = int(read_config(judged(folder), "transformer").get("sample_frames", PAPER_FRAMES))
+        prior = kind.load(folder, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
         if options.tiny_vae is not None:
             prior = _through_tiny(prior, options.tiny_vae)
     except (ValueError, OSError) as error:

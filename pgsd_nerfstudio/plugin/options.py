@@ -68,8 +68,8 @@ class WeatherOptions(Knobs, SceneOptions):
     """Whether training clips show the scene's answer (cover, wetness, light, haze), as what is looked at does. By default they
     do, except with the bundled prior, which has only ever seen flakes in a scene that stays as it is."""
     prior: str = "bundled"
-    """The video prior: bundled (small, knows only clips like the demo's), a diffusers CogVideoX folder, or a hub id such as
-    THUDM/CogVideoX-2b."""
+    """The video prior: bundled (small, knows only clips like the demo's), a diffusers folder of CogVideoX or Wan 2.1, or a
+    hub id such as THUDM/CogVideoX-2b or Wan-AI/Wan2.1-T2V-1.3B-Diffusers."""
     prompt: str | None = None
     """What the video prior is told; by default the effect's own prompt, or that of --weather, with the scene's description."""
     negative_prompt: str | None = None

@@ -1,0 +1,152 @@
+"""The parts of a Wan model as diffusers writes them: where they lie, the transformer's weights, the VAE's memory, the texts."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import importlib.util
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from pgsd_nerfstudio.guidance.folder import PARTS, PriorError, find_folder, read_config
+from pgsd_nerfstudio.guidance.text import PromptEncoder
+
+CLASSES = {"transformer": "WanTransformer3DModel", "vae": "AutoencoderKLWan"}
+EXAMPLE = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
+
+
+def is_wan(folder: Path) -> bool:
+    """Whether a folder's transformer says it is Wan's; False where it says nothing."""
+    try:
+        return read_config(folder, "transformer").get("_class_name") == CLASSES["transformer"]
+    except PriorError:
+        return False
+
+
+def find_wan(place: str | Path) -> Path:
+    """The folder of a Wan text-to-video model, judged before any weight is read.
+
+    Raises:
+        PriorError: there is no such folder or model, or it is not a complete Wan text-to-video model with one transformer.
+    """
+    folder = find_folder(place)
+    missing = [part for part in PARTS if not (folder / part).is_dir()]
+    if missing:
+        raise PriorError(
+            f"{folder} is not a diffusers Wan folder: it lacks {', '.join(missing)}; "
+            f"such a folder holds {', '.join(PARTS)} and is what diffusers' save_pretrained writes"
+        )
+    for part, expected in CLASSES.items():
+        found = read_config(folder, part).get("_class_name")
+        if found != expected:
+            raise PriorError(f"{folder / part} must hold a {expected}, found {found}; use a Wan model such as {EXAMPLE}")
+    for part in (*CLASSES, "text_encoder"):
+        if not any((folder / part).glob("*.safetensors")):
+            raise PriorError(f"{folder / part} holds no *.safetensors weights; download the model again")
+    if (folder / "transformer_2").is_dir():
+        raise PriorError(
+            f"{folder} shares the noise levels between two transformers, as Wan 2.2 does, where one is expected; "
+            f"use a Wan 2.1 model such as {EXAMPLE}"
+        )
+    taken, made = read_config(folder, "transformer").get("in_channels", 16), read_config(folder, "vae").get("z_dim", 16)
+    if taken != made:
+        raise PriorError(
+            f"{folder} takes {taken} channels where its VAE makes {made}: an image-to-video model; "
+            f"use a text-to-video one such as {EXAMPLE}"
+        )
+    prediction = read_config(folder, "scheduler").get("prediction_type", "flow_prediction")
+    if prediction != "flow_prediction":
+        raise PriorError(
+            f"the scheduler in {folder} must have the prediction_type flow_prediction, as Wan has, found {prediction}; "
+            "take the scheduler's folder from the published model"
+        )
+    return folder
+
+
+def read_transformer(folder: Path, dtype: torch.dtype) -> Any:
+    """The transformer in `dtype`, but for the parts that diffusers keeps in float32.
+
+    diffusers' own loader does this through the library accelerate only, which nothing else here needs.
+
+    Raises:
+        PriorError: weights are missing or unknown.
+        RuntimeError, OSError, SafetensorError: weights are damaged or of another size.
+    """
+    from diffusers.models.transformers.transformer_wan import WanRotaryPosEmbed, WanTransformer3DModel
+    from safetensors.torch import load_file
+
+    config: Any = WanTransformer3DModel.load_config(folder, local_files_only=True)
+    with torch.device("meta"):
+        model: Any = WanTransformer3DModel.from_config(config)
+    wide, kept = torch.promote_types(dtype, torch.float32), {*WanTransformer3DModel._keep_in_fp32_modules}
+    stored = {}
+    for file in sorted(folder.glob("*.safetensors")):
+        for name, weight in load_file(file).items():
+            stored[name] = weight.to(dtype if kept.isdisjoint(name.split(".")) else wide)
+    missing, unknown = model.load_state_dict(stored, strict=False, assign=True)
+    if missing or unknown:
+        raise PriorError(
+            f"{folder} must hold the {len(model.state_dict())} weights of its configuration, found {len(missing)} missing and "
+            f"{len(unknown)} unknown, first {[*missing, *unknown][0]}; download the model again"
+        )
+    # A table that is made, not stored: on the meta device it is empty.
+    sizes = model.config
+    model.rope = WanRotaryPosEmbed(sizes.attention_head_dim, sizes.patch_size, sizes.rope_max_seq_len)
+    return model
+
+
+def recompute_blocks(vae: Any) -> None:
+    """Let a Wan VAE's encoder keep only what goes into each residual block for the backward pass, and make the rest again.
+
+    diffusers' AutoencoderKLWan has no switch for it, since a block also reads and writes the cache that joins its chunks of
+    frames. Here the block's two entries of that cache go in and come out like its other values.
+    """
+    from diffusers.models.autoencoders.autoencoder_kl_wan import WanResidualBlock
+
+    for block in vae.encoder.modules():
+        if isinstance(block, WanResidualBlock):
+            block.forward = _recomputed(block.forward)
+
+
+def _recomputed(forward: Any) -> Any:
+    def pure(x: Tensor, *before: Tensor | None) -> tuple[Any, ...]:
+        cache = [*before]
+        return forward(x, cache, [0]), *cache
+
+    def thrifty(x: Tensor, feat_cache: list[Tensor | None], feat_idx: list[int]) -> Tensor:
+        mine = slice(feat_idx[0], feat_idx[0] + 2)
+        made, *feat_cache[mine] = checkpoint(pure, x, *feat_cache[mine], use_reentrant=False, preserve_rng_state=False)
+        feat_idx[0] += 2
+        return made
+
+    return thrifty
+
+
+class WanPromptEncoder(PromptEncoder):
+    """Embeddings by UMT5 as diffusers' pipeline makes them: cleaned texts, padding neither attended to nor passed on."""
+
+    encoder_class = "UMT5EncoderModel"
+
+    def __call__(self, texts: Sequence[str]) -> Float[Tensor, "n l d"]:
+        return super().__call__(texts if isinstance(texts, str) else [cleaned(text) for text in texts])
+
+    def _embedding(self, encoder: Any, ids: Int[Tensor, "l"]) -> Float[Tensor, "l d"]:
+        said = ids != encoder.config.pad_token_id
+        return torch.where(said[:, None], encoder(ids[None], said[None].long())[0][0], 0)
+
+
+def cleaned(text: str) -> str:
+    """A text as Wan's pipeline cleans it: HTML entities resolved, runs of white space made one space.
+
+    Where ftfy is installed, what was garbled by a wrong encoding is repaired too; plain texts are the same without it.
+    """
+    if importlib.util.find_spec("ftfy"):
+        text = importlib.import_module("ftfy").fix_text(text)
+    return re.sub(r"\s+", " ", html.unescape(html.unescape(text))).strip()
