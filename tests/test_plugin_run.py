@@ -10,6 +10,7 @@ import torch
 import yaml
 from guidance_tiny import write_tiny
 from plugin_scene import HEIGHT, VIEWS, WIDTH, tiny_config, train, write_scene
+from wan_tiny import tiny_wan
 
 from pgsd_nerfstudio.dynamics import FieldConfig, RegularizationWeights
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig
@@ -415,3 +416,12 @@ def test_a_training_says_how_much_drift_its_clips_do_not_see(prior, tmp_path, ca
             name, *numbers
         )
     assert found["simulation"].difference > 1e-4 and found["rollout"].difference == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_model_of_another_family_teaches_too(tmp_path: Path):
+    wan = tmp_path / "wan"
+    tiny_wan().save_pretrained(wan)
+    small = {"clip_frames": 5, "clip_height": 32, "clip_width": 48, "steps": 2}
+    config = train(tiny_config(write_scene(tmp_path), wan, tmp_path / "outputs", **small))
+    state = torch.load(next(config.parent.glob("nerfstudio_models/*.ckpt")))["pipeline"]
+    assert all(bool(value.any()) for key, value in state.items() if "_model.look" in key), "the learned look has left its start"
