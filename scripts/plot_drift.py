@@ -1,29 +1,32 @@
 """Draws docs/images/drift.png: drift by weight of the position loss, from what the bench wrote, and what training with and
-without the appearance loss comes to in pictures (two trainings, a few minutes each).
+without the appearance loss comes to in pictures (two trainings, a few minutes each, kept in outputs/drift).
 
 pgsd bench dynamics --json docs/figures/drift.json
-python scripts/plot_drift.py
+python scripts/plot_drift.py            --again trains anew
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
+import torch
+import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from pgsd_nerfstudio.cli.records import Record, read_records
 from pgsd_nerfstudio.cli.rows_drift import PAPER, PAPER_ADAPTIVE, learned
+from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+ROOT = Path(__file__).resolve().parent.parent
+DOCS, KEPT = ROOT / "docs", ROOT / "outputs" / "drift"
 
 
-def draw(rows: list[Record], pictures: dict[str, list[Tensor]]) -> Figure:
+def draw(rows: list[Record], shown: dict[str, list[Tensor]]) -> Figure:
     """Left: drift against weight beside the paper's. Right: the end of the weather from three views, one row per training."""
-    figure = plt.figure(figsize=(14, 6.2), constrained_layout=True)
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.7))[0]
+    figure = plt.figure(figsize=(13, 6), constrained_layout=True)
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.3))[0]
     axes, named = left.subplots(), {row.name: row.value for row in rows if row.value is not None}
     ours = [1000 * named[f"drift, constant weight {weight:g}"] for weight in PAPER]
     theirs = [1000 * drift for drift in PAPER.values()]
@@ -33,8 +36,8 @@ def draw(rows: list[Record], pictures: dict[str, list[Tensor]]) -> Figure:
     axes.axhline(1000 * PAPER_ADAPTIVE, color="tab:orange", linestyle=":", label="the same, adaptive weights")
     axes.set(xscale="log", yscale="log", xlabel="constant weight of the position loss, as in the paper", ylabel="average drift")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    for line, (name, frames) in zip(right.subplots(len(pictures), 3, squeeze=False), pictures.items(), strict=True):
+    axes.legend(fontsize=8, loc="lower left")
+    for line, (name, frames) in zip(right.subplots(len(shown), 3, squeeze=False), shown.items(), strict=True):
         for cell, frame in zip(line, frames, strict=True):
             cell.imshow(frame.permute(1, 2, 0).clamp(0, 1).numpy())
             cell.set(xticks=[], yticks=[])
@@ -42,22 +45,33 @@ def draw(rows: list[Record], pictures: dict[str, list[Tensor]]) -> Figure:
     return figure
 
 
-def main() -> None:
-    rows = read_records(DOCS / "figures" / "drift.json")
-    with TemporaryDirectory() as folder:
-        place = Path(folder)
-        with_loss = learned(place / "with")
-        without = learned(place / "without", without=("app",))
-    pictures = {
-        "curated look": with_loss.aim,
-        "wrong look, untrained": with_loss.start,
-        "trained": with_loss.end,
-        "trained without L_app": without.end,
-    }
+def pictures(again: bool) -> dict[str, list[Tensor]]:
+    """The end of the weather, by what it is."""
+    file = KEPT / "pictures.safetensors"
+    stored = None if again else load_tensors(file)
+    if stored is None:
+        with_loss, without = learned(KEPT / "with"), learned(KEPT / "without", without=("app",))
+        found = {
+            "curated look": with_loss.aim,
+            "wrong look, untrained": with_loss.start,
+            "trained": with_loss.end,
+            "trained without L_app": without.end,
+        }
+        save_tensors(file, {name: torch.stack(frames) for name, frames in found.items()}, {"order": list(found)})
+        return found
+    return {name: list(stored[0][name]) for name in stored[1]["order"]}
+
+
+def main(again: bool = False) -> None:
+    """Draw the picture.
+
+    Args:
+        again: train anew instead of taking the pictures of the last time.
+    """
     out = DOCS / "images" / "drift.png"
-    draw(rows, pictures).savefig(out, dpi=90)
+    draw(read_records(DOCS / "figures" / "drift.json"), pictures(again)).savefig(out, dpi=90)
     print(out)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)
