@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,15 @@ class Gallery:
         run = place / "pgsd-weather" / "gallery"
         if not (run / "finished").exists():
             shutil.rmtree(run, ignore_errors=True)
-            words = ["ns-train", "pgsd-weather", "--load-scene", self.load_scene, "--effect", name]
+            # The one beside this Python, whether or not its folder is on the PATH.
+            words = [
+                str(Path(sys.executable).with_name("ns-train")),
+                "pgsd-weather",
+                "--load-scene",
+                self.load_scene,
+                "--effect",
+                name,
+            ]
             words += [] if self.steps is None else ["--steps", str(self.steps)]
             words += [] if self.data is None else ["--data", str(self.data)]
             words += ["--output-dir", str(self.runs), "--experiment-name", place.name, "--timestamp", "gallery"]
