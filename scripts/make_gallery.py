@@ -68,14 +68,8 @@ class Gallery:
         if not (run / "finished").exists():
             shutil.rmtree(run, ignore_errors=True)
             # The one beside this Python, whether or not its folder is on the PATH.
-            words = [
-                str(Path(sys.executable).with_name("ns-train")),
-                "pgsd-weather",
-                "--load-scene",
-                self.load_scene,
-                "--effect",
-                name,
-            ]
+            train = str(Path(sys.executable).with_name("ns-train"))
+            words = [train, "pgsd-weather", "--load-scene", self.load_scene, "--effect", name]
             words += [] if self.steps is None else ["--steps", str(self.steps)]
             words += [] if self.data is None else ["--data", str(self.data)]
             words += ["--output-dir", str(self.runs), "--experiment-name", place.name, "--timestamp", "gallery"]
