@@ -4,6 +4,8 @@ from pathlib import Path
 
 import torch
 
+from pgsd_nerfstudio.guidance.memory import MemoryMeter
+
 WORDS = ["<pad>", "</s>", "<unk>", "snow", "is", "falling", "in", "a", "garden", "no"]
 VARIANTS = {
     "2b": {"patch_size_t": None, "use_rotary_positional_embeddings": False},
@@ -69,3 +71,12 @@ def tiny_pipeline(variant: str = "2b", seed: int = 0):
 def write_tiny(folder: Path, variant: str = "2b", seed: int = 0) -> Path:
     tiny_pipeline(variant, seed).save_pretrained(folder)
     return folder
+
+
+def there_and_back(prior, clip: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """The gradient on a clip through the prior's encoder, and the bytes that were kept for it."""
+    pixels = clip.clone().requires_grad_()
+    with MemoryMeter() as meter:
+        latents = prior.encode(pixels)
+    kept = meter.live
+    return torch.autograd.grad(latents.square().sum(), pixels)[0], kept

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from guidance_tiny import scheduler_2b, tiny_pipeline, write_tiny
+from guidance_tiny import scheduler_2b, there_and_back, tiny_pipeline, write_tiny
 
 from pgsd_nerfstudio.guidance import PriorError, VideoPrior, folder
-from pgsd_nerfstudio.guidance.memory import MemoryMeter
 from pgsd_nerfstudio.guidance.text import token_ids
 
 PROMPT, NEGATIVE = "snow is falling in a garden", "no snow"
@@ -119,13 +118,7 @@ def test_latents_are_the_scaled_mean_of_the_vae_and_differentiable(prior):
 def test_checkpointing_changes_memory_not_gradients(tiny, prior):
     clip = torch.rand(9, 3, 32, 48)
     thrifty = VideoPrior.load(tiny, checkpointing=True)
-    gradients, kept = [], []
-    for which in (prior, thrifty):
-        pixels = clip.clone().requires_grad_()
-        with MemoryMeter() as meter:
-            latents = which.encode(pixels)
-        kept.append(meter.live)
-        gradients += torch.autograd.grad(latents.square().sum(), pixels)
+    gradients, kept = zip(*(there_and_back(which, clip) for which in (prior, thrifty)), strict=True)
     assert torch.equal(gradients[0], gradients[1])
     assert kept[1] < 0.5 * kept[0]
 

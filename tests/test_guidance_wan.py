@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from guidance_tiny import write_tiny
+from guidance_tiny import there_and_back, write_tiny
 from wan_tiny import tiny_wan
 
 from pgsd_nerfstudio.guidance import DistillationConfig, PriorError, VideoPrior, distill_clip
-from pgsd_nerfstudio.guidance.memory import MemoryMeter
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
 from pgsd_nerfstudio.guidance.wan import WanPrior, alpha_bar, v_from_flow
 from pgsd_nerfstudio.guidance.wan_parts import cleaned, is_wan
@@ -171,13 +170,7 @@ def test_gradient_of_the_latents_is_the_central_difference(tiny, exact, checkpoi
 
 def test_checkpointing_changes_memory_not_gradients(tiny, prior):
     clip, thrifty = random_clip(), WanPrior.load(tiny, frames=9, checkpointing=True)
-    gradients, kept = [], []
-    for which in (prior, thrifty):
-        pixels = clip.clone().requires_grad_()
-        with MemoryMeter() as meter:
-            latents = which.encode(pixels)
-        kept.append(meter.live)
-        gradients += torch.autograd.grad(latents.square().sum(), pixels)
+    gradients, kept = zip(*(there_and_back(which, clip) for which in (prior, thrifty)), strict=True)
     assert torch.equal(gradients[0], gradients[1])
     assert kept[1] < 0.5 * kept[0]
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite, check_frame, check_window
 from pgsd_nerfstudio.dynamics.rollout import Begin, Progress
 from pgsd_nerfstudio.dynamics.state import Deltas, turned
 from pgsd_nerfstudio.physics.history import ParticleHistory
@@ -139,8 +139,7 @@ class DeformedCloud:
         Raises:
             IndexError: there is no such frame.
         """
-        if not 0 <= frame < len(self):
-            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
+        check_frame(frame, len(self))
         return self._rendered(frame, self._at(frame, visible), None).gaussians
 
     @torch.no_grad()
@@ -167,8 +166,7 @@ class DeformedCloud:
             IndexError: the clip leaves the sequence.
             FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
         """
-        if frames < 1 or not 0 <= start <= len(self) - frames:
-            raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {len(self)} frames")
+        check_window(start, frames, len(self))
         before, clip = self._at(start - 1, visible) if start else None, []
         for frame in range(start, start + frames):
             now = self._at(frame, visible)

@@ -31,6 +31,18 @@ class RolledFrame:
     """What the field added in this frame; None in a roll-out without gradient."""
 
 
+def check_frame(frame: int, total: int) -> None:
+    """Raises IndexError: there is no such frame among `total`."""
+    if not 0 <= frame < total:
+        raise IndexError(f"there are frames 0 to {total - 1}, asked for {frame}")
+
+
+def check_window(start: int, frames: int, total: int) -> None:
+    """Raises IndexError: a clip of `frames` frames from `start` leaves a sequence of `total`."""
+    if frames < 1 or not 0 <= start <= total - frames:
+        raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {total} frames")
+
+
 def check_finite(rolled: RolledFrame) -> None:
     """Raises FloatingPointError: a Gaussian is not finite; the message names quantity and frame."""
     try:

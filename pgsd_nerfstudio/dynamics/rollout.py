@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite
+from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite, check_frame, check_window
 from pgsd_nerfstudio.dynamics.state import Deltas, State, advance, fading, simulated
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.physics.history import ParticleHistory
@@ -42,7 +42,7 @@ class Rollout:
         field: DynamicsField,
         learned_look: LearnedLook | None = None,
         *,
-        stride: int = 12,
+        stride: int = 25,
         exposure: float = 0.0,
         motion: Motion = "particle",
     ) -> None:
@@ -141,7 +141,7 @@ class Rollout:
         """
         wanted = set(frames)
         for frame in wanted:
-            self._check(frame)
+            check_frame(frame, len(self))
         look, last = self._learned(), max(wanted, default=-1)
         still = self.field.still()
         for state in (simulated(self.history, frame) for frame in sorted(wanted)) if still else self._walk(last):
@@ -173,8 +173,7 @@ class Rollout:
             ValueError: `gradient_frames` is below one.
             FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
         """
-        if frames < 1 or not 0 <= start <= len(self) - frames:
-            raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {len(self)} frames")
+        check_window(start, frames, len(self))
         if gradient_frames is not None and gradient_frames < 1:
             raise ValueError(f"the gradient must run through at least one frame, got gradient_frames = {gradient_frames}")
         with torch.no_grad():
@@ -218,7 +217,7 @@ class Rollout:
 
     def _reach(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
         """The state at a frame, without gradient."""
-        self._check(frame)
+        check_frame(frame, len(self))
         if self.field.still():
             return simulated(self.history, frame, visible)
         if not self._keyframes:
@@ -237,7 +236,7 @@ class Rollout:
     def _under_way(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
         """The state from which a clip starts: what flies as the present weights have moved it since its birth, what lies as the
         last `refresh` saw it."""
-        self._check(frame)
+        check_frame(frame, len(self))
         if self.field.still():
             return simulated(self.history, frame, visible)
         flying = self.history.active(frame)
@@ -253,10 +252,6 @@ class Rollout:
         while state.frame < frame:
             state, _ = advance(state, few, look, self.field, None, self._flow)
         return replace(state, active=flying, resting=lying.resting, resting_change=lying.resting_change)
-
-    def _check(self, frame: int) -> None:
-        if not 0 <= frame < len(self):
-            raise IndexError(f"there are frames 0 to {len(self) - 1}, asked for {frame}")
 
     def _rendered(self, state: State, look: InitialLook, deltas: Deltas | None) -> RolledFrame:
         history = self.history

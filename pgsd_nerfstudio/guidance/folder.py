@@ -8,18 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 BUNDLED = Path(__file__).parent / "bundled"
-PARTS = {
-    "transformer": "CogVideoXTransformer3DModel",
-    "vae": "AutoencoderKLCogVideoX",
-    "scheduler": None,
-    "text_encoder": None,
-    "tokenizer": None,
-}
-"""Subfolders of such a model and the class their configuration must name."""
+PARTS = ("transformer", "vae", "scheduler", "text_encoder", "tokenizer")
+"""Subfolders of such a model."""
 CONFIGS = {"scheduler": "scheduler_config.json", "tokenizer": "tokenizer_config.json"}
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 SAMPLED_BLOCKS, BLOCK_BYTES = 64, 1 << 14
@@ -29,17 +25,44 @@ class PriorError(ValueError):
     """The video prior cannot be used; the message says what was expected, what was found and what to do."""
 
 
-def find_prior(place: str | Path) -> Path:
+@dataclass(frozen=True)
+class Family:
+    """What tells one family of text-to-video models from another, in the words of their configurations."""
+
+    name: str
+    classes: Mapping[str, str]
+    """Class that a part's configuration must name, by part."""
+    channels: str
+    """The VAE's key for the number of its latent channels."""
+    prediction: str
+    """The scheduler's prediction_type."""
+    example: str
+    """Hub id of a member."""
+    assumed: str | None = None
+    """The prediction_type of a scheduler that does not name one."""
+
+
+COGVIDEOX = Family(
+    "CogVideoX",
+    {"transformer": "CogVideoXTransformer3DModel", "vae": "AutoencoderKLCogVideoX"},
+    channels="latent_channels",
+    prediction="v_prediction",
+    example="THUDM/CogVideoX-2b",
+)
+
+
+def find_prior(place: str | Path, family: Family = COGVIDEOX) -> Path:
     """The folder of a video prior.
 
     Args:
         place: "bundled", a local folder, or the id of a model on the Hugging Face hub such as "THUDM/CogVideoX-2b".
+        family: what it must be.
 
     Raises:
-        PriorError: there is no such folder or model, or it is not a complete CogVideoX text-to-video model.
+        PriorError: there is no such folder or model, or it is not a complete text-to-video model of this family.
     """
     folder = find_folder(place)
-    _judge(folder)
+    _judge(folder, family)
     return folder
 
 
@@ -109,30 +132,33 @@ def _download(name: str) -> Path:
         raise PriorError(f"{missing}, and it could not be downloaded from the Hugging Face hub: {reason[0]}") from error
 
 
-def _judge(folder: Path) -> None:
+def _judge(folder: Path, family: Family) -> None:
     if not folder.is_dir():
-        raise PriorError(f"a video prior is a diffusers CogVideoX folder, but {folder} is a file")
+        raise PriorError(f"a video prior is a diffusers {family.name} folder, but {folder} is a file")
     missing = [part for part in PARTS if not (folder / part).is_dir()]
     if missing:
         raise PriorError(
-            f"{folder} is not a diffusers CogVideoX folder: it lacks {', '.join(missing)}; "
+            f"{folder} is not a diffusers {family.name} folder: it lacks {', '.join(missing)}; "
             f"such a folder holds {', '.join(PARTS)} and is what diffusers' save_pretrained writes"
         )
-    for part, expected in PARTS.items():
-        config = read_config(folder, part) if part != "tokenizer" else {}
+    for part in PARTS:
+        config, expected = read_config(folder, part) if part != "tokenizer" else {}, family.classes.get(part)
         if expected and config.get("_class_name") != expected:
-            raise PriorError(f"{folder / part} must hold a {expected}, found {config.get('_class_name')}")
+            found, use = config.get("_class_name"), f"use a {family.name} model such as {family.example}"
+            raise PriorError(f"{folder / part} must hold a {expected}, found {found}; {use}")
         weighted = part in ("transformer", "vae", "text_encoder")
         if weighted and not any((folder / part).glob("*.safetensors")):
             raise PriorError(f"{folder / part} holds no *.safetensors weights; download the model again")
-    transformer, vae = read_config(folder, "transformer"), read_config(folder, "vae")
-    if transformer.get("in_channels", 16) != vae.get("latent_channels", 16):
+    taken = read_config(folder, "transformer").get("in_channels", 16)
+    made = read_config(folder, "vae").get(family.channels, 16)
+    if taken != made:
         raise PriorError(
-            f"{folder} takes {transformer.get('in_channels')} channels where its VAE makes {vae.get('latent_channels')}: "
-            "an image-to-video model; use the text-to-video one"
+            f"{folder} takes {taken} channels where its VAE makes {made}: an image-to-video model; "
+            f"use a text-to-video one such as {family.example}"
         )
-    prediction = read_config(folder, "scheduler").get("prediction_type")
-    if prediction != "v_prediction":
+    prediction = read_config(folder, "scheduler").get("prediction_type", family.assumed)
+    if prediction != family.prediction:
         raise PriorError(
-            f"the scheduler in {folder} must have the prediction_type v_prediction, as CogVideoX has, found {prediction}"
+            f"the scheduler in {folder} must have the prediction_type {family.prediction}, as {family.name} has, found "
+            f"{prediction}; take the scheduler's folder from the published model"
         )

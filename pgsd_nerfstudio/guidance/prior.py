@@ -83,9 +83,7 @@ class VideoPrior:
         from diffusers.schedulers.scheduling_ddim_cogvideox import CogVideoXDDIMScheduler
         from diffusers.utils.import_utils import is_accelerate_available
 
-        folder, device = find_prior(place), torch.device(device)
-        if device.type == "cuda" and not torch.cuda.is_available():
-            raise PriorError("the video prior was asked onto CUDA, but no CUDA device was found; use the device cpu")
+        folder, device = find_prior(place), usable(device)
         how = {"low_cpu_mem_usage": is_accelerate_available(), "local_files_only": True}
         try:
             stored = HALF.get(stored_dtype(folder / "transformer"), torch.float32)
@@ -97,8 +95,7 @@ class VideoPrior:
             raise PriorError(f"the video prior in {folder} could not be loaded: {error}") from error
         if dtype is None and sum(p.numel() for p in transformer.parameters()) < SMALL:
             transformer, vae = transformer.float(), vae.float()
-        for model in (transformer, vae):
-            torch.nn.Module.to(model, device).eval().requires_grad_(False)
+        freeze(device, transformer, vae)
         if checkpointing or (checkpointing is None and device.type == "cuda"):
             recompute_resnets(vae)
         return VideoPrior(folder, transformer, vae, scheduler, frames)
@@ -131,10 +128,7 @@ class VideoPrior:
         Raises:
             ValueError: the clip's shape does not suit the VAE.
         """
-        if clip.ndim != 4 or clip.shape[1] != 3:
-            raise ValueError(f"a clip must have the shape [frames, 3, height, width], found {list(clip.shape)}")
-        frames, _, height, width = clip.shape
-        self._check_frames(frames)
+        height, width = self._size(clip)
         step = self._space * self.transformer.config.patch_size
         if height % step or width % step:
             raise ValueError(f"height and width of a clip must be multiples of {step} for this prior, found {height}x{width}")
@@ -177,6 +171,13 @@ class VideoPrior:
         )[0]
         return v[:, pad:].float()
 
+    def _size(self, clip: Float[Tensor, "t 3 h w"]) -> tuple[int, int]:
+        """Height and width of a clip whose shape and number of frames suit the VAE."""
+        if clip.ndim != 4 or clip.shape[1] != 3:
+            raise ValueError(f"a clip must have the shape [frames, 3, height, width], found {list(clip.shape)}")
+        self._check_frames(clip.shape[0])
+        return clip.shape[2], clip.shape[3]
+
     def _check_frames(self, frames: int) -> None:
         if frames < 1 or (frames - 1) % self._time:
             below = max(0, frames - 1) // self._time * self._time + 1
@@ -208,6 +209,24 @@ class VideoPrior:
                 height * self._space, width * self._space, frames, self.device
             )
         return self._rotary[frames, height, width]
+
+
+def usable(device: str | torch.device) -> torch.device:
+    """The device, if there is one.
+
+    Raises:
+        PriorError: it is CUDA, and there is none.
+    """
+    device = torch.device(device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise PriorError("the video prior was asked onto CUDA, but no CUDA device was found; use the device cpu")
+    return device
+
+
+def freeze(device: torch.device, *models: torch.nn.Module) -> None:
+    """Put models on a device for inference; no weight gets a gradient."""
+    for model in models:
+        torch.nn.Module.to(model, device).eval().requires_grad_(False)
 
 
 def recompute_resnets(vae: Any) -> None:

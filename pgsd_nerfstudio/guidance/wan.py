@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance.folder import PriorError, read_config
-from pgsd_nerfstudio.guidance.prior import SMALL, VideoPrior
+from pgsd_nerfstudio.guidance.prior import SMALL, VideoPrior, freeze, usable
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
 from pgsd_nerfstudio.guidance.wan_parts import WanPromptEncoder, find_wan, read_transformer, recompute_blocks
 
@@ -89,9 +89,7 @@ class WanPrior(VideoPrior):
             PriorError: nothing usable is there; see `find_wan`.
             ValueError: clips of this model cannot have so many frames.
         """
-        folder, device = find_wan(place), torch.device(device)
-        if device.type == "cuda" and not torch.cuda.is_available():
-            raise PriorError("the video prior was asked onto CUDA, but no CUDA device was found; use the device cpu")
+        folder, device = find_wan(place), usable(device)
         wanted = dtype or (torch.float32 if device.type == "cpu" else torch.bfloat16)
         try:
             from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
@@ -104,8 +102,7 @@ class WanPrior(VideoPrior):
             raise PriorError(f"the video prior in {folder} could not be loaded: {error}") from error
         if dtype is None and sum(p.numel() for p in transformer.parameters()) < SMALL:
             transformer = transformer.float()
-        for model in (transformer, vae):
-            torch.nn.Module.to(model, device).eval().requires_grad_(False)
+        freeze(device, transformer, vae)
         if checkpointing or (checkpointing is None and device.type == "cuda"):
             recompute_blocks(vae)
         return WanPrior(folder, transformer, vae, frames, read_config(folder, "scheduler").get("num_train_timesteps", 1000))
@@ -128,10 +125,7 @@ class WanPrior(VideoPrior):
         Raises:
             ValueError: the clip's shape does not suit the VAE or the transformer's patches.
         """
-        if clip.ndim != 4 or clip.shape[1] != 3:
-            raise ValueError(f"a clip must have the shape [frames, 3, height, width], found {list(clip.shape)}")
-        frames, _, height, width = clip.shape
-        self._check_frames(frames)
+        height, width = self._size(clip)
         rows, columns = (self._space * patch for patch in self.transformer.config.patch_size[1:])
         if height % rows or width % columns:
             raise ValueError(

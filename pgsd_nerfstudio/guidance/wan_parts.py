@@ -15,17 +15,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from pgsd_nerfstudio.guidance.folder import PARTS, PriorError, find_folder, read_config
+from pgsd_nerfstudio.guidance.folder import Family, PriorError, find_prior, read_config
 from pgsd_nerfstudio.guidance.text import PromptEncoder
 
-CLASSES = {"transformer": "WanTransformer3DModel", "vae": "AutoencoderKLWan"}
-EXAMPLE = "Wan-AI/Wan2.1-T2V-1.3B-Diffusers"
+WAN = Family(
+    "Wan",
+    {"transformer": "WanTransformer3DModel", "vae": "AutoencoderKLWan"},
+    channels="z_dim",
+    prediction="flow_prediction",
+    example="Wan-AI/Wan2.1-T2V-1.3B-Diffusers",
+    assumed="flow_prediction",
+)
 
 
 def is_wan(folder: Path) -> bool:
     """Whether a folder's transformer says it is Wan's; False where it says nothing."""
     try:
-        return read_config(folder, "transformer").get("_class_name") == CLASSES["transformer"]
+        return read_config(folder, "transformer").get("_class_name") == WAN.classes["transformer"]
     except PriorError:
         return False
 
@@ -36,36 +42,11 @@ def find_wan(place: str | Path) -> Path:
     Raises:
         PriorError: there is no such folder or model, or it is not a complete Wan text-to-video model with one transformer.
     """
-    folder = find_folder(place)
-    missing = [part for part in PARTS if not (folder / part).is_dir()]
-    if missing:
-        raise PriorError(
-            f"{folder} is not a diffusers Wan folder: it lacks {', '.join(missing)}; "
-            f"such a folder holds {', '.join(PARTS)} and is what diffusers' save_pretrained writes"
-        )
-    for part, expected in CLASSES.items():
-        found = read_config(folder, part).get("_class_name")
-        if found != expected:
-            raise PriorError(f"{folder / part} must hold a {expected}, found {found}; use a Wan model such as {EXAMPLE}")
-    for part in (*CLASSES, "text_encoder"):
-        if not any((folder / part).glob("*.safetensors")):
-            raise PriorError(f"{folder / part} holds no *.safetensors weights; download the model again")
+    folder = find_prior(place, WAN)
     if (folder / "transformer_2").is_dir():
         raise PriorError(
             f"{folder} shares the noise levels between two transformers, as Wan 2.2 does, where one is expected; "
-            f"use a Wan 2.1 model such as {EXAMPLE}"
-        )
-    taken, made = read_config(folder, "transformer").get("in_channels", 16), read_config(folder, "vae").get("z_dim", 16)
-    if taken != made:
-        raise PriorError(
-            f"{folder} takes {taken} channels where its VAE makes {made}: an image-to-video model; "
-            f"use a text-to-video one such as {EXAMPLE}"
-        )
-    prediction = read_config(folder, "scheduler").get("prediction_type", "flow_prediction")
-    if prediction != "flow_prediction":
-        raise PriorError(
-            f"the scheduler in {folder} must have the prediction_type flow_prediction, as Wan has, found {prediction}; "
-            "take the scheduler's folder from the published model"
+            f"use a Wan 2.1 model such as {WAN.example}"
         )
     return folder
 

@@ -38,7 +38,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.weather import InitialLook, initial_look
 
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
-STRIDE = 8  # frames between kept states: a jump in time, and the start of a training clip, costs 3.5 frames on average
+STRIDE = 8  # frames between kept states: a jump in time, and what lies in a training clip, costs 3.5 frames on average
 
 
 @dataclass
@@ -91,7 +91,7 @@ class WeatherModel(SplatfactoModel):
         return dynamics, Rollout(self.history, look, dynamics, self.look, **how)
 
     def get_extra_state(self) -> dict[str, Tensor]:
-        """Weights with which the states were made that clips start from: an interrupted training goes on from those."""
+        """Weights with which the states were made that clips take what lies from: interrupted training goes on with them."""
         return dict(getattr(self.rollout, "refreshed", None) or {})
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
