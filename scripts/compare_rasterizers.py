@@ -20,9 +20,9 @@ import torch
 import tyro
 from rich.console import Console
 
-from pgsd_nerfstudio.cli.bench_rasterizer import Case, against_torch, costs, leaves, psnr, weights_for
-from pgsd_nerfstudio.cli.records import Record, print_records, write_records
-from pgsd_nerfstudio.cli.timing import least
+from pgsd_nerfstudio.laboratory.records import Record, print_records, write_records
+from pgsd_nerfstudio.laboratory.rows.rasterizer import Case, against_torch, costs, leaves, psnr, weights_for
+from pgsd_nerfstudio.laboratory.timing import least
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras

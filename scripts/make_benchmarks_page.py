@@ -10,7 +10,7 @@ from __future__ import annotations
 from itertools import groupby
 from pathlib import Path
 
-from pgsd_nerfstudio.cli.records import Record, figure, read_records, split_source, verdict
+from pgsd_nerfstudio.laboratory.records import Record, figure, read_records, split_source, verdict
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 LONG = 60  # rows from which a table is folded away

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import tyro
 
-from pgsd_nerfstudio.cli.flight import choose_views, fly
 from pgsd_nerfstudio.cli.preview import open_scene
+from pgsd_nerfstudio.scene.camera_path import choose_views, fly
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,11 +21,11 @@ import tyro
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from pgsd_nerfstudio.cli.flight import choose_views
 from pgsd_nerfstudio.cli.video import to_bytes
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
+from pgsd_nerfstudio.effects.effect import EFFECTS
+from pgsd_nerfstudio.scene.camera_path import choose_views
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.weather.effect import EFFECTS
 
 TIMES = (0.05, 0.35, 0.65, 0.95)  # of the whole weather, those of the paper's own sheets
 GAP = 4  # pixels between pictures
@@ -82,7 +82,7 @@ class Gallery:
 
         _, pipeline, _, _ = eval_setup(config)
         model = pipeline.model
-        scene, history = model.stage.scene, model.history
+        scene, history = model.prepared.scene, model.history
         exposure = model.config.options.chosen_effect().appearance.exposure
         untrained = Rollout(history, model.rollout.look, DynamicsField.for_history(history), exposure=exposure)
         learned = not model.rollout.field.still() or any(bool(p.any()) for p in model.look.parameters())
@@ -97,7 +97,7 @@ class Gallery:
 
     def _picture(self, model, camera: Cameras, rollout: Rollout, share: float) -> np.ndarray:  # type: ignore[no-untyped-def]
         frame = model.frame_at(share)
-        weather = model.stage.scene.frame.gaussians_to_scene(rollout.gaussians(frame))
+        weather = model.prepared.scene.frame.gaussians_to_scene(rollout.gaussians(frame))
         with torch.no_grad():
             return to_bytes(model.render(camera, weather, None, model.answer, frame).rgb[0])
 

@@ -15,8 +15,8 @@ import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pgsd_nerfstudio.cli.records import Record, read_records
-from pgsd_nerfstudio.cli.rows_drift import PAPER, PAPER_ADAPTIVE, learned
+from pgsd_nerfstudio.laboratory.records import Record, read_records
+from pgsd_nerfstudio.laboratory.rows.drift import PAPER, PAPER_ADAPTIVE, learned
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pgsd_nerfstudio.cli.records import Record, read_records
+from pgsd_nerfstudio.laboratory.records import Record, read_records
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 ROW = re.compile(r"(forward\+backward|forward), (exact|layers (\d+)), (\d+x\d+), ([\d.]+)k frozen, ([\d.]+)k dynamic")

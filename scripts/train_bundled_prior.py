@@ -331,7 +331,7 @@ def descend_from_wrong(training: Training, log: Log) -> None:
         return
     from bundled_prior.descent import descend
 
-    from pgsd_nerfstudio.weather import effect
+    from pgsd_nerfstudio.effects import effect
 
     rows = {}
     for name, negative in (("the effect's", effect("snowfall").negative_prompt), ("empty", "")):

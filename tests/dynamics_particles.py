@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 
 from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout
-from pgsd_nerfstudio.physics.history import ParticleHistory
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 
 def falling(count: int = 60, frames: int = 40, seed: int = 0) -> ParticleHistory:

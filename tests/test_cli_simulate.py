@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from pgsd_nerfstudio.cli.main import run
-from pgsd_nerfstudio.physics import Clock, Domain, simulate
-from pgsd_nerfstudio.physics.report import report
+from pgsd_nerfstudio.effects import SNOWFALL
+from pgsd_nerfstudio.effects.snowfall import fall_speed, mass
+from pgsd_nerfstudio.physics import Clock, Domain, simulate_metric
+from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import SNOWFALL
-from pgsd_nerfstudio.weather.snowfall import fall_speed, mass
 
 DOMAIN = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 3.0))
 
@@ -23,7 +23,7 @@ DOMAIN = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 3.0))
 def history():
     floor = torch.tensor([[-4.0, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]])
     surface = SurfaceMesh(floor, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
-    return simulate(surface, SNOWFALL, Clock(frames=75), DOMAIN, max_particles=1500, progress=False)
+    return simulate_metric(surface, SNOWFALL, Clock(frames=75), DOMAIN, max_particles=1500, progress=False)
 
 
 def test_every_particle_and_its_mass_is_accounted_for(history):

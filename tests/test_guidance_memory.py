@@ -9,8 +9,8 @@ from guidance_tiny import tiny_pipeline
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.checkpoint import checkpoint
 
-from pgsd_nerfstudio.cli.rows_prior_costs import rows
 from pgsd_nerfstudio.guidance.memory import MemoryMeter, weights
+from pgsd_nerfstudio.laboratory.rows.prior_costs import rows
 
 N = 1000
 BYTES = 4 * N

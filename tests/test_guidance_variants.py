@@ -310,7 +310,7 @@ def test_what_the_prompt_itself_asks_for_is_no_flaw():
 
 
 def test_built_in_effects_are_known_by_name():
-    from pgsd_nerfstudio.weather import EFFECTS
+    from pgsd_nerfstudio.effects import EFFECTS
 
     assert set(BELONGS) == {"snowfall", "rainfall", "fog", "sandstorm"} <= set(EFFECTS)
 

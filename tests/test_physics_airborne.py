@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics.airborne import _SINE, GRAVITY, Flutter, advance
+from pgsd_nerfstudio.effects.effect import Wind
+from pgsd_nerfstudio.physics.air.airborne import _SINE, Flutter, advance
+from pgsd_nerfstudio.physics.air.deflection import Deflection
+from pgsd_nerfstudio.physics.air.wind import WindField
+from pgsd_nerfstudio.physics.bodies import GRAVITY
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.deflection import Deflection
-from pgsd_nerfstudio.physics.wind import WindField
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather.effect import Wind
 
 WIND = WindField.draw(Wind(), 3)
 TOLERANCE = {np.float32: 2e-5, np.float64: 1e-12}

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate
-from pgsd_nerfstudio.physics.air import Air
-from pgsd_nerfstudio.physics.arrival import Arrival
-from pgsd_nerfstudio.physics.chunks import SPLASHED, Bodies
-from pgsd_nerfstudio.physics.contact import Ground
-from pgsd_nerfstudio.physics.emitters import feed, fill
-from pgsd_nerfstudio.physics.populations import fall_speed
-from pgsd_nerfstudio.physics.report import report
+from pgsd_nerfstudio.effects import FOG, RAINFALL, SNOWFALL, Effect, Wind
+from pgsd_nerfstudio.effects.timeline import Timeline
+from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate_metric
+from pgsd_nerfstudio.physics.air.air import Air
+from pgsd_nerfstudio.physics.air.arrival import Arrival
+from pgsd_nerfstudio.physics.air.emitters import feed, fill
+from pgsd_nerfstudio.physics.bodies import SPLASHED, Bodies
+from pgsd_nerfstudio.physics.ground.landing import Ground
+from pgsd_nerfstudio.physics.laws.populations import fall_speed
+from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import FOG, RAINFALL, SNOWFALL, Effect, Wind
-from pgsd_nerfstudio.weather.spell import Spell
 
 DOMAIN = Domain((-4.0, -3.0, -0.2), (4.0, 3.0, 3.0))
 FPS, FRAMES, MOST, ONSET = 25.0, 90, 3000, 2.0
@@ -39,7 +39,7 @@ def courtyard() -> SurfaceMesh:
 
 
 def run(
-    spell: Spell,
+    timeline: Timeline,
     effect: Effect = SNOWFALL,
     *,
     surface: SurfaceMesh | None = None,
@@ -48,9 +48,9 @@ def run(
     cameras: Cameras | None = None,
     resume: Path | None = None,
 ) -> ParticleHistory:
-    return simulate(
+    return simulate_metric(
         SurfaceMesh.empty() if surface is None else surface,
-        replace(effect, spell=spell),
+        replace(effect, timeline=timeline),
         Clock(FPS, frames),
         DOMAIN,
         max_particles=max_particles,
@@ -112,27 +112,27 @@ def cameras() -> Cameras:
 
 @pytest.fixture(scope="module")
 def steady() -> ParticleHistory:
-    return run(Spell(), snow_in(3.0))
+    return run(Timeline(), snow_in(3.0))
 
 
 @pytest.fixture(scope="module", params=COURSES)
-def spell(request) -> Spell:
-    return Spell(onset=ONSET, arrives=request.param)
+def timeline(request) -> Timeline:
+    return Timeline(onset=ONSET, arrives=request.param)
 
 
 @pytest.fixture(scope="module")
-def coming(spell) -> ParticleHistory:
-    return run(spell, snow_in(3.0))
+def coming(timeline) -> ParticleHistory:
+    return run(timeline, snow_in(3.0))
 
 
 @pytest.mark.parametrize("effect", [SNOWFALL, RAINFALL, FOG], ids=lambda e: e.name)
 def test_without_an_onset_every_bit_is_what_it_was_before_there_were_spells(effect, monkeypatch):
     settings = {"surface": courtyard(), "frames": 12, "max_particles": 150, "cameras": cameras()}
-    now = run(Spell(), effect, **settings)
-    front = run(Spell(arrives="as a front"), effect, **settings)
+    now = run(Timeline(), effect, **settings)
+    front = run(Timeline(arrives="as a front"), effect, **settings)
     monkeypatch.setattr(Air, "arriving", lambda air, frame: first_as_it_was(air))
     monkeypatch.setattr(Air, "entering", entering_as_it_was)
-    before = run(Spell(), effect, **settings)
+    before = run(Timeline(), effect, **settings)
     assert same(now, before)
     assert same(front, before)
 
@@ -144,11 +144,11 @@ def test_the_first_frame_is_clear(coming):
 
 @pytest.mark.parametrize("course", COURSES)
 def test_a_single_clear_frame_is_a_history_without_particles(course):
-    assert len(run(Spell(onset=1.0, arrives=course), frames=1)) == 0
+    assert len(run(Timeline(onset=1.0, arrives=course), frames=1)) == 0
 
 
-def test_the_number_in_the_air_rises_as_the_share_that_has_come(spell, coming, steady):
-    arrival = Arrival.of(spell, DOMAIN, STEADY)
+def test_the_number_in_the_air_rises_as_the_share_that_has_come(timeline, coming, steady):
+    arrival = Arrival.of(timeline, DOMAIN, STEADY)
     number, full = counts(coming), counts(steady)
     for frame in range(5, 50, 5):
         share = arrival.share(frame / FPS)
@@ -164,7 +164,7 @@ def test_after_the_onset_there_is_as_much_as_if_it_had_always_been(coming, stead
 def test_what_is_there_at_first_without_an_onset_comes_within_it_at_the_same_places():
     calm = replace(SNOWFALL, wind=Wind(speed=0.0, turbulence=0.0, flutter=0.0))
     settings = {"effect": calm, "frames": 60, "max_particles": 800}
-    at_once, by_and_by = run(Spell(), **settings), run(Spell(onset=ONSET), **settings)
+    at_once, by_and_by = run(Timeline(), **settings), run(Timeline(onset=ONSET), **settings)
     places = by_and_by.positions[by_and_by.offsets[:-1]].double()
     distance, which = torch.cdist(at_once.positions_at(0, at_once.active(0)).double(), places).min(1)
     assert distance.max() < 2e-4  # the lattice on which positions are kept
@@ -176,13 +176,13 @@ def test_what_is_there_at_first_without_an_onset_comes_within_it_at_the_same_pla
 
 @pytest.mark.parametrize("speed", [0.0, 2.0, 6.0], ids=["calm", "slower than the front", "faster than the front"])
 def test_air_behind_a_front_is_full_and_even_and_ahead_of_it_there_is_nothing(speed):
-    spell = Spell(onset=ONSET, arrives="as a front")
+    timeline = Timeline(onset=ONSET, arrives="as a front")
     effect = snow_in(speed)
-    history, arrival = run(spell, effect, frames=51), Arrival.of(spell, DOMAIN, effect.wind)
+    history, arrival = run(timeline, effect, frames=51), Arrival.of(timeline, DOMAIN, effect.wind)
     window = history.window(0, 51)
     late = np.stack([arrival.times(window.positions[:, frame].numpy()) - frame / FPS for frame in range(51)], 1)
     assert late[window.active.numpy()].max() < 1e-5
-    full = counts(run(Spell(), effect, frames=1))[0]
+    full = counts(run(Timeline(), effect, frames=1))[0]
     for frame in (20, 35, 50):
         times = arrival.times(history.positions_at(frame, history.active(frame)).numpy())
         edges = np.linspace(0.0, frame / FPS, 5)
@@ -193,7 +193,7 @@ def test_air_behind_a_front_is_full_and_even_and_ahead_of_it_there_is_nothing(sp
 
 @pytest.mark.parametrize(("effect", "course"), [(SNOWFALL, "everywhere"), (SNOWFALL, "as a front"), (RAINFALL, "everywhere")])
 def test_none_enters_after_the_end_and_what_flies_goes_on(effect, course):
-    history = run(Spell(onset=1.0, arrives=course, ends=1.6), effect, surface=courtyard(), frames=50, max_particles=150)
+    history = run(Timeline(onset=1.0, arrives=course, ends=1.6), effect, surface=courtyard(), frames=50, max_particles=150)
     droplets = (history.kinds & SPLASHED) > 0
     assert int(history.births[~droplets].max()) == 40
     number = counts(history)
@@ -203,8 +203,8 @@ def test_none_enters_after_the_end_and_what_flies_goes_on(effect, course):
 
 @pytest.mark.parametrize("course", COURSES)
 def test_an_interrupted_onset_goes_on_to_the_same_bits(course, tmp_path, monkeypatch):
-    spell, settings = Spell(onset=2.5, arrives=course), {"surface": courtyard(), "frames": 52, "max_particles": 400}
-    whole, meet, calls = run(spell, **settings), Ground.meet, []
+    timeline, settings = Timeline(onset=2.5, arrives=course), {"surface": courtyard(), "frames": 52, "max_particles": 400}
+    whole, meet, calls = run(timeline, **settings), Ground.meet, []
 
     def interrupted(self, *arguments):
         calls.append(0)
@@ -214,8 +214,8 @@ def test_an_interrupted_onset_goes_on_to_the_same_bits(course, tmp_path, monkeyp
 
     monkeypatch.setattr(Ground, "meet", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(spell, **settings, resume=tmp_path)
-    assert same(whole, run(spell, **settings, resume=tmp_path))
+        run(timeline, **settings, resume=tmp_path)
+    assert same(whole, run(timeline, **settings, resume=tmp_path))
     assert len(calls) == 40 + 27  # frames 25 to 51
 
 
@@ -223,7 +223,7 @@ def test_an_interrupted_onset_goes_on_to_the_same_bits(course, tmp_path, monkeyp
 @pytest.mark.parametrize("course", COURSES)
 def test_particles_and_mass_are_accounted_for(course, speed):
     effect = snow_in(speed)
-    history = run(Spell(onset=1.5, arrives=course, ends=2.0), effect, surface=courtyard(), frames=60, max_particles=500)
+    history = run(Timeline(onset=1.5, arrives=course, ends=2.0), effect, surface=courtyard(), frames=60, max_particles=500)
     about, said = history.about, report(history, SNOWFALL.material)
     ends = about["landed"] + about["absorbed"] + about["left"] + about["unseen"] + about["in_air"]
     assert about["emitted"] == len(history) == ends
@@ -233,20 +233,20 @@ def test_particles_and_mass_are_accounted_for(course, speed):
 
 @pytest.mark.parametrize("course", COURSES)
 def test_what_comes_later_is_left_out_too_where_no_camera_can_see_it(course):
-    module = importlib.import_module("pgsd_nerfstudio.physics.simulate")
-    spell, calm = Spell(onset=ONSET, arrives=course), snow_in(0.0)
+    module = importlib.import_module("pgsd_nerfstudio.physics.metric")
+    timeline, calm = Timeline(onset=ONSET, arrives=course), snow_in(0.0)
     sight = module._sight(calm, DOMAIN, cameras())
-    history = run(spell, calm, frames=50, cameras=cameras())
+    history = run(timeline, calm, frames=50, cameras=cameras())
     assert sight.share < 0.7
     places = history.positions[history.offsets[:-1]].numpy()
     assert sight.needed(places).mean() > 0.999  # but for the lattice on which positions are kept
-    assert len(history) < 0.8 * len(run(spell, calm, frames=50))
+    assert len(history) < 0.8 * len(run(timeline, calm, frames=50))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 25.0, 90.0, 200.0, 301.0])
 def test_a_front_goes_evenly_from_the_upwind_to_the_downwind_corner(degrees):
-    spell, wind = Spell(onset=3.0, arrives="as a front"), Wind(direction_degrees=degrees)
-    arrival = Arrival.of(spell, DOMAIN, wind)
+    timeline, wind = Timeline(onset=3.0, arrives="as a front"), Wind(direction_degrees=degrees)
+    arrival = Arrival.of(timeline, DOMAIN, wind)
     corners = np.array([[x, y, 1.0] for x in (-4.0, 4.0) for y in (-3.0, 3.0)])
     assert arrival.times(corners).min() == pytest.approx(0.0, abs=1e-12)
     assert arrival.times(corners).max() == pytest.approx(3.0)
@@ -260,7 +260,7 @@ def test_a_front_goes_evenly_from_the_upwind_to_the_downwind_corner(degrees):
 
 
 def test_what_arrives_everywhere_comes_when_it_is_drawn():
-    arrival = Arrival.of(Spell(onset=4.0), DOMAIN, STEADY)
+    arrival = Arrival.of(Timeline(onset=4.0), DOMAIN, STEADY)
     points = np.zeros((3, 3))
     assert arrival.times(points, np.array([0.0, 0.25, 1.0])).tolist() == [0.0, 1.0, 4.0]
     assert arrival.share(1.0) == 0.25
@@ -271,7 +271,7 @@ def test_what_arrives_everywhere_comes_when_it_is_drawn():
 
 
 def test_without_an_onset_it_is_everywhere_at_once():
-    arrival = Arrival.of(Spell(arrives="as a front", ends=2.0), DOMAIN, STEADY)
+    arrival = Arrival.of(Timeline(arrives="as a front", ends=2.0), DOMAIN, STEADY)
     assert (arrival.times(np.ones((2, 3))) == 0).all()
     assert arrival.front_position(0.0) == math.inf
     assert arrival.share(0.0) == 1.0

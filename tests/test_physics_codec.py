@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pgsd_nerfstudio.physics.codec import Steps, decode, encode, quantised
+from pgsd_nerfstudio.physics.record.codec import Steps, decode, encode, quantised
 
 QUANTUM = 2.0**-14
 

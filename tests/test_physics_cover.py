@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.columns import AROUND, BORDER, DROP, WALL, Columns
-from pgsd_nerfstudio.physics.cover import Cover, CoverConfig
+from pgsd_nerfstudio.physics.ground.columns import AROUND, BORDER, DROP, WALL, Columns
+from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 DOMAIN = Domain((-2.0, -2.0, -3.5), (2.0, 2.0, 3.6))

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from pgsd_nerfstudio.effects.effect import Wind
+from pgsd_nerfstudio.physics.air.deflection import MOST, Deflection, Faces, Lattice, mass_consistent, open_faces
+from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.deflection import MOST, Deflection, Faces, Lattice, mass_consistent, open_faces
-from pgsd_nerfstudio.physics.wind import WindField, law_of_the_wall
+from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather.effect import Wind
 
 DOMAIN = Domain((-4.0, -4.0, -0.3), (4.0, 4.0, 4.0))
 ALONG_X = np.array([1.0, 0.0])

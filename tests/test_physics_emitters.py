@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pgsd_nerfstudio.effects import SNOWFALL
+from pgsd_nerfstudio.effects.snowfall import fall_speed, mass, melted_diameter, number_density
+from pgsd_nerfstudio.physics.air.emitters import Sizes, feed, fill
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.emitters import Sizes, feed, fill
-from pgsd_nerfstudio.weather import SNOWFALL
-from pgsd_nerfstudio.weather.snowfall import fall_speed, mass, melted_diameter, number_density
 
 DOMAIN = Domain((-2.0, -3.0, 0.0), (2.0, 3.0, 5.0))
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from pgsd_nerfstudio.physics.fall_speeds import (
+from pgsd_nerfstudio.physics.laws.fall_speeds import (
     AIR_DENSITY,
     AIR_VISCOSITY,
-    GRAVITY,
     QUARTZ_DENSITY,
     SPHERE_UP_TO,
+    STANDARD_GRAVITY,
     STOKES_UP_TO,
     WATER_DENSITY,
     fog_fall_speed,
@@ -51,7 +51,7 @@ def sphere_speed(diameter: float) -> float:
         speed = (low + high) / 2
         reynolds = AIR_DENSITY * speed * diameter / AIR_VISCOSITY
         drag = 24 / reynolds * (1 + 0.15 * reynolds**0.687) * math.pi / 8 * AIR_DENSITY * (diameter * speed) ** 2
-        weight = math.pi / 6 * diameter**3 * (WATER_DENSITY - AIR_DENSITY) * GRAVITY
+        weight = math.pi / 6 * diameter**3 * (WATER_DENSITY - AIR_DENSITY) * STANDARD_GRAVITY
         low, high = (low, speed) if drag > weight else (speed, high)
     return low
 
@@ -87,7 +87,7 @@ def test_sand_falls_as_soulsby_found(micrometres):
     The grain numbers of sand in air, 3-46, are those of grains of 0.1-1.9 mm in water, where it was fitted.
     """
     diameter, viscosity = 1e-6 * micrometres, AIR_VISCOSITY / AIR_DENSITY
-    grain = diameter * (GRAVITY * (QUARTZ_DENSITY / AIR_DENSITY - 1) / viscosity**2) ** (1 / 3)
+    grain = diameter * (STANDARD_GRAVITY * (QUARTZ_DENSITY / AIR_DENSITY - 1) / viscosity**2) ** (1 / 3)
     expected = viscosity / diameter * (math.sqrt(10.36**2 + 1.049 * grain**3) - 10.36)
     assert sand_fall_speed(np.array([diameter]))[0] == pytest.approx(expected, rel=0.12)
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics.chunks import Chunk, State, assemble
+from pgsd_nerfstudio.physics.bodies import RunState
 from pgsd_nerfstudio.physics.clock import Clock
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.physics.record.chunks import Chunk, assemble
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 
@@ -152,7 +153,7 @@ def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_
         rest_quats=none.reshape(0, 4),
         rest_extents=none,
         rest_covers=none,
-        state=replace(State.empty(), born=count),
+        state=replace(RunState.empty(), born=count),
     )
     fresh = assemble([chunk], Clock(fps=25.0, frames=frames), {})
     fresh.save(tmp_path / "h.safetensors")

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from pgsd_nerfstudio.laboratory.experiments.solids import snow_layer, throw_snowball
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.mpm import ACTIVE, RESTING, Mpm, MpmConfig, Obstacle, Sleep, Snow
-from pgsd_nerfstudio.physics.mpm.experiments import snow_layer, throw_snowball
 from pgsd_nerfstudio.physics.mpm.layout import MASS, VOLUME
 
 FLOOR = Obstacle.plane((0, 0, 0.1), (0, 0, 1))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from pgsd_nerfstudio.laboratory.experiments import solids as cases
+from pgsd_nerfstudio.laboratory.experiments.potential_flow import collapse, front, rates
+from pgsd_nerfstudio.laboratory.experiments.sand import heap_slope, run_out
+from pgsd_nerfstudio.laboratory.experiments.water import MARTIN_MOYCE, dam_break, dam_break_in_theory, passage
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.mpm import Elastic, Mpm, MpmConfig, Obstacle, Snow, Water
-from pgsd_nerfstudio.physics.mpm import experiments as cases
-from pgsd_nerfstudio.physics.mpm.experiments_sand import heap_slope, run_out
-from pgsd_nerfstudio.physics.mpm.experiments_water import MARTIN_MOYCE, dam_break, dam_break_in_theory, passage
-from pgsd_nerfstudio.physics.mpm.potential_flow import collapse, front, rates
 
 BOX = Domain((0, 0, 0), (1, 1, 1))
 

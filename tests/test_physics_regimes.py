@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate
-from pgsd_nerfstudio.physics.air import Air
-from pgsd_nerfstudio.physics.arrival import Arrival
-from pgsd_nerfstudio.physics.chunks import DENSE, SLID, SPLASHED
-from pgsd_nerfstudio.physics.contact import Ground
-from pgsd_nerfstudio.physics.emitters import Sizes
-from pgsd_nerfstudio.physics.report import report
-from pgsd_nerfstudio.physics.sight import Sight
-from pgsd_nerfstudio.physics.splash import splashed
-from pgsd_nerfstudio.physics.wind import WindField
+from pgsd_nerfstudio.effects import FOG, RAINFALL, SANDSTORM, SNOWFALL, Effect, Splash, Wind
+from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate_metric
+from pgsd_nerfstudio.physics.air.air import Air
+from pgsd_nerfstudio.physics.air.arrival import Arrival
+from pgsd_nerfstudio.physics.air.emitters import Sizes
+from pgsd_nerfstudio.physics.air.sight import Sight
+from pgsd_nerfstudio.physics.air.splash import splashed
+from pgsd_nerfstudio.physics.air.wind import WindField
+from pgsd_nerfstudio.physics.bodies import DENSE, SLID, SPLASHED
+from pgsd_nerfstudio.physics.ground.landing import Ground
+from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import FOG, RAINFALL, SANDSTORM, SNOWFALL, Effect, Splash, Wind
 
 DOMAIN = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 4.0))
 STILL = Wind(speed=0.0, turbulence=0.0, flutter=0.0)
@@ -40,7 +40,7 @@ def floor() -> SurfaceMesh:
 
 def run(effect: Effect, surface: SurfaceMesh, frames: int = 75, **settings) -> ParticleHistory:
     settings = {"max_particles": 1500, "progress": False} | settings
-    return simulate(surface, effect, Clock(frames=frames), DOMAIN, **settings)
+    return simulate_metric(surface, effect, Clock(frames=frames), DOMAIN, **settings)
 
 
 def slippery(speedup: float = 800.0) -> Effect:
@@ -112,7 +112,7 @@ def test_what_vanishes_leaves_nothing():
 def air_of(effect: Effect) -> Air:
     sizes = Sizes.of(effect, DOMAIN.volume, 100)
     ground = Ground.of(floor(), effect.surface, DOMAIN)
-    wind, arrival = WindField.draw(effect.wind, 0), Arrival.of(effect.spell, DOMAIN, effect.wind)
+    wind, arrival = WindField.draw(effect.wind, 0), Arrival.of(effect.timeline, DOMAIN, effect.wind)
     return Air(DOMAIN, sizes, wind, arrival, effect, ground, Sight.everything(), 0.04, 0)
 
 
@@ -189,7 +189,7 @@ def test_sand_lands_where_the_wind_comes_from():
 
 
 def test_what_no_camera_sees_is_left_out_and_what_it_sees_is_not():
-    from pgsd_nerfstudio.cli.yard import view_into_yard
+    from pgsd_nerfstudio.laboratory.yard import view_into_yard
 
     camera = view_into_yard(16, 16)
     camera = replace(camera, Ks=camera.Ks * torch.tensor([[8.0, 1, 1], [1, 8, 1], [1, 1, 1]]))  # a narrow view
@@ -203,7 +203,9 @@ def test_what_no_camera_sees_is_left_out_and_what_it_sees_is_not():
 def test_scenes_of_any_size_run(effect, size):
     small = SurfaceMesh(3 * size * SQUARE, FACES)
     lower, upper = np.array([-2.0, -2.0, -0.2]) * size, np.array([2.0, 2.0, 4.0]) * size
-    history = simulate(small, effect, Clock(frames=8), Domain(tuple(lower), tuple(upper)), max_particles=100, progress=False)
+    history = simulate_metric(
+        small, effect, Clock(frames=8), Domain(tuple(lower), tuple(upper)), max_particles=100, progress=False
+    )
     history.check_finite()
 
 

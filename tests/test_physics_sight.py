@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics.airborne import Flutter, advance
+from pgsd_nerfstudio.effects.effect import Wind
+from pgsd_nerfstudio.physics.air.airborne import Flutter, advance
+from pgsd_nerfstudio.physics.air.sight import GUST_RATES, INSTANTS, MOST, Sight, _reach
+from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.sight import GUST_RATES, INSTANTS, MOST, Sight, _reach
-from pgsd_nerfstudio.physics.wind import WindField, law_of_the_wall
+from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.weather.effect import Wind
 
 DOMAIN = Domain((-10.0, -10.0, -0.3), (10.0, 10.0, 5.0))
 LOWER, SIZE = np.array(DOMAIN.lower), np.array(DOMAIN.size)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pgsd_nerfstudio.physics.fall_speeds import fog_fall_speed, sand_fall_speed
-from pgsd_nerfstudio.physics.size_distributions import (
+from pgsd_nerfstudio.physics.laws.fall_speeds import fog_fall_speed, sand_fall_speed
+from pgsd_nerfstudio.physics.laws.size_distributions import (
     Exponential,
     LogNormal,
     advection_fog,
@@ -64,7 +64,7 @@ def test_rescaled_rain_brings_exactly_the_rate(rate):
 
 def test_sampled_rain_brings_exactly_the_rate_too():
     drops, rng = with_rain_rate(MARSHALL_PALMER, 5.0), np.random.default_rng(0)
-    from pgsd_nerfstudio.physics.fall_speeds import rain_fall_speed
+    from pgsd_nerfstudio.physics.laws.fall_speeds import rain_fall_speed
 
     diameter = drops.sample(400_000, rng)
     water = drops.moment(0) * np.mean(np.pi / 6 * diameter**3 * rain_fall_speed(diameter))

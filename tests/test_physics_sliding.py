@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics.airborne import GRAVITY
-from pgsd_nerfstudio.physics.chunks import Bodies
-from pgsd_nerfstudio.physics.sliding import LIFT, slide
+from pgsd_nerfstudio.physics.bodies import GRAVITY, Bodies
+from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 STEP = 0.04

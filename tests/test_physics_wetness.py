@@ -11,9 +11,9 @@ import torch
 from scipy.linalg import expm
 from scipy.special import ive
 
-import pgsd_nerfstudio.physics.wetness as module
+import pgsd_nerfstudio.physics.ground.wetness as module
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.wetness import WetnessGrid, Wetting
+from pgsd_nerfstudio.physics.ground.wetness import WetnessGrid, Wetting
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 WETTING = Wetting(cell=0.05, diffusivity=2e-4, drying_seconds=math.inf)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pgsd_nerfstudio.physics.wind import WindField
-from pgsd_nerfstudio.weather.effect import Wind
+from pgsd_nerfstudio.effects.effect import Wind
+from pgsd_nerfstudio.physics.air.wind import WindField
 
 
 @pytest.mark.parametrize("heights", [(0.05, 0.6), (0.6, 3.0), (3.0, 20.0)])

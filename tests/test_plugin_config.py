@@ -11,15 +11,15 @@ import torch
 import tyro
 import yaml
 from plugin_scene import tiny_config, write_scene
-from test_weather_asking import GOOD, keys, needs_library, serving  # noqa: F401
+from test_effects_language_model import GOOD, keys, needs_library, serving  # noqa: F401
 
+from pgsd_nerfstudio.effects.application import applied
+from pgsd_nerfstudio.effects.knobs import Knobs
+from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig, pgsd_weather
+from pgsd_nerfstudio.plugin.distiller import Distiller
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.guide import Guide
 from pgsd_nerfstudio.plugin.options import WeatherOptions
-from pgsd_nerfstudio.weather.granting import granted
-from pgsd_nerfstudio.weather.knobs import Knobs
-from pgsd_nerfstudio.weather.reader import read
 
 
 @pytest.fixture
@@ -126,11 +126,11 @@ def test_words_are_read_once_and_the_saved_config_says_what_they_mean(
     loaded = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
     options = loaded.pipeline.options
     assert options == config.pipeline.options == loaded.options()
-    assert options.chosen_effect() == granted(read("heavy purple blorp rain").wish)
+    assert options.chosen_effect() == applied(read("heavy purple blorp rain").request)
     # What is kept is what counts, even if words should be read otherwise one day; of other words it says nothing.
-    options.understood["wish"]["size"] = 3.0
-    assert options.chosen_effect() == granted(replace(read("heavy purple blorp rain").wish, size=3.0))
-    assert replace(options, weather="thin fog").chosen_effect() == granted(read("thin fog").wish)
+    options.understood["request"]["size"] = 3.0
+    assert options.chosen_effect() == applied(replace(read("heavy purple blorp rain").request, size=3.0))
+    assert replace(options, weather="thin fog").chosen_effect() == applied(read("thin fog").request)
     assert replace(options, weather=None).chosen_effect() == WeatherOptions(load_scene=scene).chosen_effect()
 
 
@@ -145,7 +145,7 @@ def test_a_language_model_is_asked_once_for_a_run_and_never_when_it_is_opened(
         config.set_timestamp()
         config.save_config()
         assert len(server.asked) == 1
-    assert [path.name[:5] for path in (tmp_path / "cache/wishes").iterdir()] == ["wish-"]
+    assert [path.name[:5] for path in (tmp_path / "cache/requests").iterdir()] == ["request-"]
     monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "elsewhere"))
     text = (config.get_base_dir() / "config.yml").read_text()
     options = yaml.load(text, Loader=yaml.Loader).pipeline.options
@@ -159,9 +159,9 @@ def test_the_video_prior_is_told_what_the_words_say_unless_there_is_a_prompt(sce
             return torch.zeros(len(texts), 1, 1)
 
     words = parse("--load-scene", scene, "--data", scene.parent, "--weather", "purple snow").options()
-    assert Guide.listening(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]
+    assert Distiller.listening(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]
     told = replace(words, prompt="A purple day")
-    assert Guide.listening(Deaf(), told, "a yard").wanted == "A purple day"  # type: ignore[arg-type]
+    assert Distiller.listening(Deaf(), told, "a yard").wanted == "A purple day"  # type: ignore[arg-type]
 
 
 # The command that makes a run again.

@@ -22,7 +22,7 @@ def manager(tmp_path_factory: pytest.TempPathFactory) -> TrajectoryDataManager:
 
 def test_a_trajectory_leads_from_one_training_view_to_another_at_the_clips_size(manager: TrajectoryDataManager):
     cameras, batch = manager.next_train(3)
-    views = manager.stage.scene.cameras.opengl()[:, :3]
+    views = manager.prepared.scene.cameras.opengl()[:, :3]
     assert cameras.shape == (5,) and int(cameras.height[0]) == 16 and int(cameras.width[0]) == 24
     first, last = batch["views"]
     torch.testing.assert_close(cameras.camera_to_worlds[0], views[first], atol=1e-5, rtol=0)
@@ -47,7 +47,7 @@ def test_a_step_has_one_trajectory_and_evaluation_another(manager: TrajectoryDat
 
 
 def test_partners_are_the_nearest_views_and_never_the_view_itself(manager: TrajectoryDataManager):
-    views = manager.stage.scene.cameras
+    views = manager.prepared.scene.cameras
     assert sorted(partners(views, 2, 2).tolist()) == [1, 3]
     assert sorted(partners(views, 2, None).tolist()) == [0, 1, 3, 4, 5]
     assert partners(views[torch.tensor([0])], 0, None).tolist() == [0], "a single view goes nowhere"
@@ -61,7 +61,7 @@ def test_views_have_times_over_the_whole_weather(manager: TrajectoryDataManager)
 
 def test_missing_photographs_are_rendered_once_and_kept(manager: TrajectoryDataManager, monkeypatch: pytest.MonkeyPatch):
     image = manager.train_dataset[0]["image"]
-    rendered = manager.stage.rasterizer.render(manager.stage.scene.cameras[0]).rgb[0]
+    rendered = manager.prepared.rasterizer.render(manager.prepared.scene.cameras[0]).rgb[0]
     assert image.shape == (HEIGHT, WIDTH, 3)
     assert float((image - rendered).abs().max()) < 1 / 255
     assert manager.train_dataset.image_filenames[0].is_relative_to(cache_dir())

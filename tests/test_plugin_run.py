@@ -39,11 +39,11 @@ def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def forbidden(*_: object, **__: object) -> None:
         raise AssertionError("only training may do this")
 
-    simulation = importlib.import_module("pgsd_nerfstudio.physics.prior")
+    simulation = importlib.import_module("pgsd_nerfstudio.physics.motion_prior")
     monkeypatch.setattr(simulation, "simulate", forbidden)
     monkeypatch.setattr(simulation, "motion_prior", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.response.exposure.Exposure.of", forbidden)
-    monkeypatch.setattr("pgsd_nerfstudio.guidance.prior.VideoPrior.load", forbidden)
+    monkeypatch.setattr("pgsd_nerfstudio.guidance.video_prior.VideoPrior.load", forbidden)
     return trained
 
 
@@ -55,7 +55,7 @@ def opened(config: Path, mode: str = "test"):
 
 def at(pipeline, time: float | None) -> torch.Tensor:
     """The picture of the first view at a time."""
-    camera = to_nerfstudio(pipeline.model.stage.scene.cameras[0], None if time is None else torch.tensor([time]))
+    camera = to_nerfstudio(pipeline.model.prepared.scene.cameras[0], None if time is None else torch.tensor([time]))
     return pipeline.model.get_outputs_for_camera(camera)["rgb"]
 
 
@@ -107,7 +107,7 @@ def test_the_knobs_change_the_picture(run: Path):
     panel.size.value = 3.0
     assert float((at(pipeline, 0.5) - snowed).abs().max()) > 0.05
     panel.shown.value = False
-    frozen = pipeline.model.render(pipeline.model.stage.scene.cameras[0], None).rgb[0].clamp(0, 1)
+    frozen = pipeline.model.render(pipeline.model.prepared.scene.cameras[0], None).rgb[0].clamp(0, 1)
     torch.testing.assert_close(at(pipeline, 0.5), frozen)
 
 
@@ -129,9 +129,9 @@ def test_surfaces_and_haze_of_the_panel_change_the_scene_and_not_the_flakes(run:
 def test_training_clips_show_the_answer_unless_the_bundled_prior_looks_at_them(prior: Path, tmp_path: Path, monkeypatch):
     seen = []
 
-    def spy(stage, views, weather, background, moments):
+    def spy(prepared, views, weather, background, moments):
         seen.append([moment is not None for moment in moments])
-        return render(stage, views, weather, background, moments)
+        return render(prepared, views, weather, background, moments)
 
     module = importlib.import_module("pgsd_nerfstudio.plugin.pipeline")
     render = module.render_clip
@@ -145,7 +145,7 @@ def test_training_clips_show_the_answer_unless_the_bundled_prior_looks_at_them(p
 
 def test_depth_and_accumulation_come_along(run: Path):
     pipeline = opened(run)
-    outputs = pipeline.model.get_outputs_for_camera(to_nerfstudio(pipeline.model.stage.scene.cameras[0], torch.zeros(1)))
+    outputs = pipeline.model.get_outputs_for_camera(to_nerfstudio(pipeline.model.prepared.scene.cameras[0], torch.zeros(1)))
     assert {name: tuple(value.shape) for name, value in outputs.items()} == {
         "rgb": (HEIGHT, WIDTH, 3),
         "depth": (HEIGHT, WIDTH, 1),
@@ -160,7 +160,7 @@ def test_the_crop_box_of_the_viewer_cuts_scene_and_weather(run: Path):
     from nerfstudio.data.scene_box import OrientedBox
 
     pipeline = opened(run)
-    camera = to_nerfstudio(pipeline.model.stage.scene.cameras[0], torch.ones(1))
+    camera = to_nerfstudio(pipeline.model.prepared.scene.cameras[0], torch.ones(1))
     box = OrientedBox(R=torch.eye(3), T=torch.tensor([0.0, 0, 0.8]), S=torch.tensor([2.0, 2, 0.4]))
     cut = pipeline.model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
     whole = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
@@ -303,7 +303,7 @@ def test_an_interrupted_training_keeps_what_it_has_learned(
 
 
 def test_a_full_disk_is_said_in_a_sentence(prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from pgsd_nerfstudio.physics.history import ParticleHistory
+    from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
     def full(self: ParticleHistory, path: Path) -> None:
         raise OSError(f"could not write {path}: No space left on device")
@@ -316,7 +316,7 @@ def test_a_full_disk_is_said_in_a_sentence(prior: Path, tmp_path: Path, monkeypa
 def test_a_prior_that_predicts_nan_skips_its_step_and_is_given_up_after_three_with_a_checkpoint(
     trained: Path, prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from pgsd_nerfstudio.guidance.prior import VideoPrior
+    from pgsd_nerfstudio.guidance.video_prior import VideoPrior
 
     whole, calls = VideoPrior.predict_v, []
 
@@ -362,7 +362,7 @@ def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Pa
 
     ExportGaussianSplat(load_config=run, output_dir=tmp_path).main()
     pipeline = opened(run)
-    scene, weather = pipeline.model.stage.scene.gaussians, pipeline.model.weather_at(FRAMES - 1)
+    scene, weather = pipeline.model.prepared.scene.gaussians, pipeline.model.weather_at(FRAMES - 1)
     stored = read_ply(tmp_path / "splat.ply")
     visible = weather.opacities > 1 / 255
     assert len(stored) == len(scene) + int(visible.sum()) and len(weather) > 50
@@ -381,7 +381,7 @@ def test_ns_render_writes_all_four_kinds_of_video(run: Path, tmp_path: Path):
 
     RenderInterpolated(run, tmp_path / "interpolate.mp4", interpolation_steps=2).main()
     SpiralRender(run, tmp_path / "spiral.mp4", seconds=0.25).main()
-    matrix = opened(run).model.stage.scene.cameras.opengl()[0].flatten().tolist()
+    matrix = opened(run).model.prepared.scene.cameras.opengl()[0].flatten().tolist()
     keyframes = [{"camera_to_world": matrix, "fov": 50, "aspect": 1.5, "render_time": time} for time in (0.0, 0.5, 1.0)]
     path = {"render_width": 48, "render_height": 32, "seconds": 0.2, "camera_path": keyframes}
     (tmp_path / "path.json").write_text(json.dumps(path))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pgsd_nerfstudio.cli.bench_rasterizer import leaves, psnr
+from pgsd_nerfstudio.laboratory.rows.rasterizer import leaves, psnr
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians, relative_error

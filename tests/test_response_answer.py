@@ -6,22 +6,22 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from pgsd_nerfstudio.effects import effect
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.effects.effect import EFFECTS, Effect
+from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer, baked
+from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure
-from pgsd_nerfstudio.response.haze import HazeField
+from pgsd_nerfstudio.response.haze_field import HazeField
 from pgsd_nerfstudio.response.landed import in_place
-from pgsd_nerfstudio.response.layers import Layers
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather import effect
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
-from pgsd_nerfstudio.weather.effect import EFFECTS, Effect
-from pgsd_nerfstudio.weather.spell import Spell
 
 GRID, UNIT = 12, 2.0  # Gaussians along a side of the floor; metres per scene unit
 FRAME = Frame(UNIT, torch.eye(3), torch.zeros(3))
@@ -52,7 +52,7 @@ def answer(what: Effect, edits: Edits | None = None, sheltered: float = 0.0) -> 
     exposure = Exposure(
         torch.tensor([0.0, 0, 1]).repeat(n, 1), torch.zeros(n, dtype=torch.bool), open_to, torch.ones(n), open_to
     )
-    layers = Layers.of(what, exposure, UNIT * floor().means)
+    layers = Coating.of(what, exposure, UNIT * floor().means)
     haze = HazeField.of(what, FRAME, Domain((-3.0, -3, -0.3), (3.0, 3, 3)))
     return Answer(what, exposure, layers, None, torch.eye(3), UNIT, haze, edits, 10.0)
 
@@ -63,7 +63,7 @@ def picture(what: Answer, seconds: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_second_0_of_a_weather_that_starts_clear_is_the_untouched_scene_to_the_bit(name: str):
-    clear = replace(EFFECTS[name], spell=Spell(onset=2.0))
+    clear = replace(EFFECTS[name], timeline=Timeline(onset=2.0))
     assert answer(clear).at(0.0) is None
     assert torch.equal(picture(answer(clear), 0.0), CpuRasterizer(floor()).render(camera()).rgb[0])
     assert not torch.equal(picture(answer(clear), 2.0), CpuRasterizer(floor()).render(camera()).rgb[0])
@@ -114,7 +114,7 @@ def test_wet_ground_mirrors_the_sky_at_grazing_angles_and_dry_ground_does_not():
 def test_ambience_is_light_times_a_factor_and_comes_with_the_weather():
     snow = effect("snowfall")
     dimmer = replace(snow.ambience, stops=-1.0, tint=(1.0, 1.0, 1.0), saturation=1.0)
-    dark = replace(snow, ambience=dimmer, surface=replace(snow.surface, accumulates=False), spell=Spell(onset=4.0))
+    dark = replace(snow, ambience=dimmer, surface=replace(snow.surface, accumulates=False), timeline=Timeline(onset=4.0))
     assert lit(dark, 4.0).mean() == pytest.approx(0.4 * 0.5 ** (1 / 2.2), rel=1e-4)
     assert lit(dark, 2.0).mean() == pytest.approx(0.4 * 0.75 ** (1 / 2.2), rel=1e-4)
 

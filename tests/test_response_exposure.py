@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.physics.populations import fall_speed, number_density
+from pgsd_nerfstudio.effects import effect
+from pgsd_nerfstudio.physics.laws.populations import fall_speed, number_density
 from pgsd_nerfstudio.response.exposure import Exposure, arrivals
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import effect
 
 CALM = replace(effect("rainfall"), wind=replace(effect("rainfall").wind, speed=0.0, turbulence=0.0, gustiness=0.0))
 

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 from plugin_scene import write_scene
 
+from pgsd_nerfstudio.effects import effect
 from pgsd_nerfstudio.response import prepare
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.edits import Edits
@@ -16,7 +17,6 @@ from pgsd_nerfstudio.response.sunlight import Sunlight
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import effect
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def floor() -> SurfaceMesh:
 
 def same(one: Answer, other: Answer) -> bool:
     pairs = [(getattr(one.exposure, f.name), getattr(other.exposure, f.name)) for f in fields(Exposure)]
-    pairs += [(one.layers.thickness_rate, other.layers.thickness_rate)]
+    pairs += [(one.coating.thickness_rate, other.coating.thickness_rate)]
     return all(torch.equal(a, b) for a, b in pairs)
 
 

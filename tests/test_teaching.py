@@ -9,16 +9,16 @@ import torch
 
 from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout, regularization
 from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights
+from pgsd_nerfstudio.effects import effect, initial_look
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
 from pgsd_nerfstudio.guidance import DistillationConfig, VideoPrior, distill_clip
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, regularization_scale
-from pgsd_nerfstudio.physics import Clock, simulate
+from pgsd_nerfstudio.physics import Clock, simulate_metric
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import effect, initial_look
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 STEPS = 16
 PATHS = ((25, 27, 40), (8, 10, 20))  # two training views and the first frame of the clip
@@ -47,7 +47,7 @@ def lesson():
     vertices, triangles = scene.mesh
     surface = SurfaceMesh(scene.frame.to_metric(vertices), triangles)
     clock = Clock(fps=25.0, frames=60)
-    history = simulate(surface, snow, clock, domain_of(scene), seed=3, max_particles=20_000, progress=False)
+    history = simulate_metric(surface, snow, clock, domain_of(scene), seed=3, max_particles=20_000, progress=False)
     curated = initial_look(snow, history, seed=3)
     start = InitialLook(wrong(curated.active), wrong(curated.collided), curated.settle_seconds)
     prior, rasterizer = VideoPrior.load("bundled", "cpu"), choose_rasterizer(scene.gaussians, "cpu")

@@ -23,6 +23,6 @@ class Bench:
     """Exit with 2 if a row does not hold its target."""
 
     def run(self) -> int:
-        from pgsd_nerfstudio.cli.rooms import run_rooms
+        from pgsd_nerfstudio.laboratory.rooms import run_rooms
 
         return run_rooms("bench", self.room, quick=self.quick, json=self.json, strict=self.strict)

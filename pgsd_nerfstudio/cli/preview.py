@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
-from pgsd_nerfstudio.weather.knobs import Knobs
+from pgsd_nerfstudio.effects.knobs import Knobs
 
 if TYPE_CHECKING:
     from rich.console import Console
     from torch import Tensor
 
+    from pgsd_nerfstudio.effects import Effect
     from pgsd_nerfstudio.scene.cameras import Cameras
     from pgsd_nerfstudio.scene.scene import Scene
-    from pgsd_nerfstudio.weather import Effect
 
 
 @dataclass(kw_only=True)
@@ -121,7 +121,7 @@ class Preview(Knobs, Simulated):
         return max(0, round(self.seconds * self.fps) - self.frames)
 
     def _cameras(self, scene: Scene) -> Cameras:
-        from pgsd_nerfstudio.cli.flight import choose_views, fly
+        from pgsd_nerfstudio.scene.camera_path import choose_views, fly
 
         count = len(scene.cameras)
         first, last = self.views or choose_views(scene.cameras, scene.frame)
@@ -135,12 +135,12 @@ class Preview(Knobs, Simulated):
         import torch
 
         from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
+        from pgsd_nerfstudio.effects import initial_look
         from pgsd_nerfstudio.physics import MAX_PARTICLES, Clock, motion_prior
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.response.landed import in_place
         from pgsd_nerfstudio.response.prepare import answer_of, edits_of
         from pgsd_nerfstudio.surface.mesh import surface_of
-        from pgsd_nerfstudio.weather import initial_look
 
         device = "cuda" if torch.cuda.is_available() else "cpu"
         rasterizer = choose_rasterizer(scene.gaussians, device)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pgsd_nerfstudio.cli.preview import Simulated, effect_told, open_scene, say
 from pgsd_nerfstudio.cli.refusal import Refusal, refusing
-from pgsd_nerfstudio.weather.knobs import Knobs
+from pgsd_nerfstudio.effects.knobs import Knobs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ class Simulate(Knobs, Simulated):
 
     def run(self) -> int:
         from pgsd_nerfstudio.physics import Clock, motion_prior
-        from pgsd_nerfstudio.physics.report import report
+        from pgsd_nerfstudio.physics.record.report import report
         from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
 

@@ -5,8 +5,8 @@ from pgsd_nerfstudio.dynamics.drift import Gap, drift, gaps
 from pgsd_nerfstudio.dynamics.field import DeltaBounds, DynamicsField, FieldConfig
 from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights, regularization
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame
 from pgsd_nerfstudio.dynamics.rollout import Begin, Motion, Rollout
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 
 __all__ = [
@@ -21,8 +21,8 @@ __all__ = [
     "LearnedLook",
     "Motion",
     "RegularizationWeights",
-    "RolledFrame",
     "Rollout",
+    "RolloutFrame",
     "VelocityField",
     "drift",
     "gaps",

@@ -21,12 +21,12 @@ from torch import Tensor, nn
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite, check_frame, check_window
 from pgsd_nerfstudio.dynamics.rollout import Begin, Progress
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_finite, check_frame, check_window
 from pgsd_nerfstudio.dynamics.state import Deltas, turned
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.effects.appearance import InitialLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather.appearance import InitialLook
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,7 @@ def scattered(box: Float[Tensor, "2 3"], like: ParticleHistory, count: int, *, s
 class _Deformed(NamedTuple):
     """Some particles at one frame."""
 
-    ids: Int[Tensor, "n"]
+    ids: Int[Tensor, " n"]
     moved: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     change: Change
@@ -133,7 +133,7 @@ class DeformedCloud:
         """Nothing to do: without recurrence no state has to be kept."""
 
     @torch.no_grad()
-    def gaussians(self, frame: int, visible: Bool[Tensor, "p"] | None = None) -> Gaussians:
+    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None) -> Gaussians:
         """The Gaussians of any frame, without gradient.
 
         Raises:
@@ -143,7 +143,7 @@ class DeformedCloud:
         return self._rendered(frame, self._at(frame, visible), None).gaussians
 
     @torch.no_grad()
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolledFrame]:
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolloutFrame]:
         """Frames start .. stop (exclusive) one after the other, without gradient."""
         for frame in range(start, len(self) if stop is None else stop):
             yield self._rendered(frame, self._at(frame, None), None)
@@ -153,10 +153,10 @@ class DeformedCloud:
         start: int,
         frames: int,
         *,
-        visible: Bool[Tensor, "p"] | None = None,
+        visible: Bool[Tensor, " p"] | None = None,
         begin: Begin = "rollout",
         gradient_frames: int | None = None,
-    ) -> list[RolledFrame]:
+    ) -> list[RolloutFrame]:
         """A clip with gradient to network and learned look.
 
         `begin` and `gradient_frames` speak of a recurrence and do nothing here. Deltas are the differences to the frame
@@ -175,7 +175,7 @@ class DeformedCloud:
             before = now
         return clip
 
-    def _at(self, frame: int, visible: Bool[Tensor, "p"] | None) -> _Deformed:
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None) -> _Deformed:
         ids = self.history.active(frame)
         ids = ids if visible is None else ids[visible[ids]]
         moved, rotation, change = self.deformation(self.history.positions_at(0, ids), frame)
@@ -185,13 +185,13 @@ class DeformedCloud:
     def _initial(self) -> InitialLook:
         return self.look if self.learned_look is None else self.learned_look(self.look)
 
-    def _rendered(self, frame: int, now: _Deformed, before: _Deformed | None) -> RolledFrame:
+    def _rendered(self, frame: int, now: _Deformed, before: _Deformed | None) -> RolloutFrame:
         ids, moved, quats, change = now
         look = changed(self._initial().active.select(ids), change)
         places = self.history.positions_at(0, ids) + moved
         gaussians = Gaussians(places, quats, look.scales, look.opacity, look.rgb)
         deltas = None if before is None else _deltas(before, now)
-        return RolledFrame(frame, gaussians, ids, ids[:0], moved, quats, self.history.quats[ids], deltas)
+        return RolloutFrame(frame, gaussians, ids, ids[:0], moved, quats, self.history.quats[ids], deltas)
 
 
 def _deltas(before: _Deformed, now: _Deformed) -> Deltas:

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import torch
 
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame
 from pgsd_nerfstudio.dynamics.rollout import Begin, Rollout
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 
 
-def drift(frames: Iterable[RolledFrame]) -> float:
+def drift(frames: Iterable[RolloutFrame]) -> float:
     """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
     return _average(_distance(rolled) for rolled in frames)
 
@@ -54,7 +54,7 @@ def gaps(
     return found
 
 
-def _distance(rolled: RolledFrame) -> float | None:
+def _distance(rolled: RolloutFrame) -> float | None:
     """Mean distance in metres of one frame; None where no particle is in the air."""
     return float(rolled.offset.detach().norm(dim=1).mean()) if len(rolled.active) else None
 

@@ -19,8 +19,8 @@ from torch.nn.functional import linear
 
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.look import Change
-from pgsd_nerfstudio.physics.history import ParticleHistory
-from pgsd_nerfstudio.weather.appearance import ParticleLook
+from pgsd_nerfstudio.effects.appearance import ParticleLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 HIDDEN = 128
 LOOK = {"opacity": 1, "scale": 3, "rgb": 3}  # heads of the appearance

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
 
 LOG_SCALE_BOUND = math.log(8.0)
 LOGIT_BOUND = 6.0
@@ -23,7 +23,7 @@ OPACITY_UNIT, COLOUR_UNIT = 3.0, 2.0  # one number moves a look as far as anothe
 class Change(NamedTuple):
     """What is added to the appearance of n particles."""
 
-    opacity: Float[Tensor, "n"]
+    opacity: Float[Tensor, " n"]
     log_scale: Float[Tensor, "n 3"]
     rgb: Float[Tensor, "n 3"]
 
@@ -32,7 +32,7 @@ class Change(NamedTuple):
         """No change of `count` particles; device and dtype of `like`."""
         return Change(like.new_zeros(count), like.new_zeros(count, 3), like.new_zeros(count, 3))
 
-    def times(self, factor: Float[Tensor, "n"]) -> Change:
+    def times(self, factor: Float[Tensor, " n"]) -> Change:
         return Change(self.opacity * factor, self.log_scale * factor[:, None], self.rgb * factor[:, None])
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.look import LearnedLook
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 
 EPSILON = 1e-6
 APPEARANCE = tuple(f"{state}_{name}" for state in ("active", "collided") for name in ("opacity", "scale", "rgb"))
@@ -94,7 +94,7 @@ class RegularizationWeights:
 
 
 def regularization(
-    clip: Sequence[RolledFrame], learned_look: LearnedLook | None = None, form: Form = "norms"
+    clip: Sequence[RolloutFrame], learned_look: LearnedLook | None = None, form: Form = "norms"
 ) -> dict[str, Tensor]:
     """The terms of one clip, named and formed as in RegularizationWeights; zero where there is no particle."""
     stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
@@ -119,23 +119,23 @@ def regularization(
     return terms
 
 
-def safe_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
+def safe_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
     """L2 norm per row; its gradient is finite everywhere and zero at zero."""
     return (x.square().sum(dim=1) + EPSILON**2).sqrt() - EPSILON
 
 
-def squared_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, "n"]:
+def squared_norm(x: Float[Tensor, "n k"]) -> Float[Tensor, " n"]:
     """Squared L2 norm per row."""
     return x.square().sum(dim=1)
 
 
-def quaternion_difference(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+def quaternion_difference(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, " n"]:
     """|a - b|^2 of wxyz quaternions, of both signs of `a` the nearer: 2 - 2 |a . b|, for small angles angle^2 / 4."""
     sign = torch.where((a * b).sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
     return squared_norm(sign * a - b)
 
 
-def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
+def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, " n"]:
     """Angle in radians, 0..pi, between two orientations given as wxyz quaternions: 2 arccos |a . b|.
 
     Computed as 2 atan2 of the sine and cosine of the half angle: the arccos has an infinite gradient at equal orientations.
@@ -150,6 +150,6 @@ class _Mean:
     def __init__(self, zero: Tensor) -> None:
         self._zero = zero
 
-    def __call__(self, rows: Iterable[Float[Tensor, "n"]]) -> Tensor:
+    def __call__(self, rows: Iterable[Float[Tensor, " n"]]) -> Tensor:
         every = torch.cat([self._zero[None], *rows])
         return every.sum() / max(len(every) - 1, 1)

@@ -9,7 +9,7 @@ and keeps a state every `stride` frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -20,12 +20,12 @@ from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
-from pgsd_nerfstudio.dynamics.rolled import RolledFrame, check_finite, check_frame, check_window
-from pgsd_nerfstudio.dynamics.state import Deltas, State, advance, fading, simulated
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_finite, check_frame, check_window
+from pgsd_nerfstudio.dynamics.state import Deltas, RolloutState, advance, fading, simulated
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 Progress = Callable[[int, int], None]
 Begin = Literal["rollout", "simulation"]
@@ -61,11 +61,11 @@ class Rollout:
             raise ValueError(f'motion must be "particle" or "field", got "{motion}"')
         self.history, self.look, self.field, self.learned_look, self.stride = history, look, field, learned_look, stride
         self.exposure, self.motion = exposure, motion
-        self._keyframes: dict[int, State] = {}
+        self._keyframes: dict[int, RolloutState] = {}
         self._stamp: tuple[int, ...] = ()
         self.refreshed: dict[str, Tensor] | None = None
         """Weights that the kept states were made with; None before the first `refresh`."""
-        self._last: State | None = None
+        self._last: RolloutState | None = None
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -115,7 +115,7 @@ class Rollout:
             part.load_state_dict({k.removeprefix(f"{name}."): v for k, v in weights.items() if k.startswith(f"{name}.")})
 
     @torch.no_grad()
-    def gaussians(self, frame: int, visible: Bool[Tensor, "p"] | None = None) -> Gaussians:
+    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None) -> Gaussians:
         """The Gaussians of any frame, without gradient; neighbouring frames in ascending order are cheapest.
 
         Rolls from the kept state before `frame` (made by a first `refresh` if there is none yet, see `stale`).
@@ -126,14 +126,14 @@ class Rollout:
         return self._rendered(self._reach(frame, visible), self._learned(), None).gaussians
 
     @torch.no_grad()
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolledFrame]:
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolloutFrame]:
         """Frames start .. stop (exclusive) one after the other, without gradient; for rendering and measuring."""
         look = self._learned()
         for frame in range(start, len(self) if stop is None else stop):
             yield self._rendered(self._reach(frame, None), look, None)
 
     @torch.no_grad()
-    def afresh(self, frames: Collection[int]) -> Iterator[RolledFrame]:
+    def afresh(self, frames: Collection[int]) -> Iterator[RolloutFrame]:
         """These frames in ascending order, rolled from the first of all with the present weights; kept states stay as they are.
 
         Raises:
@@ -153,10 +153,10 @@ class Rollout:
         start: int,
         frames: int,
         *,
-        visible: Bool[Tensor, "p"] | None = None,
+        visible: Bool[Tensor, " p"] | None = None,
         begin: Begin = "rollout",
         gradient_frames: int | None = None,
-    ) -> list[RolledFrame]:
+    ) -> list[RolloutFrame]:
         """A clip with gradient to field and learned look: true recurrence from its first frame to its last.
 
         Args:
@@ -195,7 +195,7 @@ class Rollout:
     def _flow(self) -> VelocityField | None:
         return VelocityField.of(self.history) if self.motion == "field" else None
 
-    def _walk(self, last: int) -> Iterator[State]:
+    def _walk(self, last: int) -> Iterator[RolloutState]:
         """The states of frames 0 .. last with the present weights."""
         look, state = self._learned(), simulated(self.history, 0)
         yield state
@@ -215,7 +215,7 @@ class Rollout:
         modules = [self.field, *([self.learned_look] if self.learned_look else [])]
         return tuple(number for module in modules for p in module.parameters() for number in (id(p), p._version))
 
-    def _reach(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
+    def _reach(self, frame: int, visible: Bool[Tensor, " p"] | None) -> RolloutState:
         """The state at a frame, without gradient."""
         check_frame(frame, len(self))
         if self.field.still():
@@ -233,7 +233,7 @@ class Rollout:
             self._last = state
         return state
 
-    def _under_way(self, frame: int, visible: Bool[Tensor, "p"] | None) -> State:
+    def _under_way(self, frame: int, visible: Bool[Tensor, " p"] | None) -> RolloutState:
         """The state from which a clip starts: what flies as the present weights have moved it since its birth, what lies as the
         last `refresh` saw it."""
         check_frame(frame, len(self))
@@ -253,7 +253,7 @@ class Rollout:
             state, _ = advance(state, few, look, self.field, None, self._flow)
         return replace(state, active=flying, resting=lying.resting, resting_change=lying.resting_change)
 
-    def _rendered(self, state: State, look: InitialLook, deltas: Deltas | None) -> RolledFrame:
+    def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None) -> RolloutFrame:
         history = self.history
         fade = fading(history, state.frame, state.active)
         offset = state.offset * fade[:, None]
@@ -269,9 +269,9 @@ class Rollout:
             self._displacements(state),
         )
         simulated_quats = history.quats[state.active]
-        return RolledFrame(state.frame, gaussians, state.active, state.resting, offset, state.quats, simulated_quats, deltas)
+        return RolloutFrame(state.frame, gaussians, state.active, state.resting, offset, state.quats, simulated_quats, deltas)
 
-    def _displacements(self, state: State) -> Float[Tensor, "k 3"] | None:
+    def _displacements(self, state: RolloutState) -> Float[Tensor, "k 3"] | None:
         """Metres while the shutter is open, of all that is rendered; what lies does not move. None where nothing is smeared."""
         if self.exposure == 0.0:
             return None

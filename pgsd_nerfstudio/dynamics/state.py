@@ -21,8 +21,8 @@ from torch import Tensor
 from pgsd_nerfstudio.dynamics.field import ActiveDelta, DynamicsField
 from pgsd_nerfstudio.dynamics.look import Change, accumulate, changed
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
-from pgsd_nerfstudio.physics.history import ParticleHistory
-from pgsd_nerfstudio.weather.appearance import InitialLook
+from pgsd_nerfstudio.effects.appearance import InitialLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 LANDING_FRAMES = 5
 """Over so many frames before contact everything learned in flight fades out: the particle lands where and as physics says,
@@ -30,26 +30,26 @@ without a jump. (The paper leaves open what becomes of an offset on landing; dro
 
 
 @dataclass(frozen=True)
-class State:
+class RolloutState:
     """All particles at one frame."""
 
     frame: int
-    active: Int[Tensor, "n"]
+    active: Int[Tensor, " n"]
     """Ids of the particles in the air, ascending."""
     offset: Float[Tensor, "n 3"]
     """Learned part of the position, metres, before it fades for landing."""
     quats: Float[Tensor, "n 4"]
     active_change: Change
-    resting: Int[Tensor, "m"]
+    resting: Int[Tensor, " m"]
     """Ids of the particles that have landed, ascending."""
     resting_change: Change
 
-    def select(self, visible: Bool[Tensor, "p"] | None) -> State:
+    def select(self, visible: Bool[Tensor, " p"] | None) -> RolloutState:
         """Only the visible ones."""
         if visible is None:
             return self
         a, r = visible[self.active], visible[self.resting]
-        return State(
+        return RolloutState(
             self.frame,
             self.active[a],
             self.offset[a],
@@ -59,7 +59,7 @@ class State:
             Change(*(x[r] for x in self.resting_change)),
         )
 
-    def detach(self) -> State:
+    def detach(self) -> RolloutState:
         """The same without its past."""
         return replace(
             self,
@@ -77,11 +77,11 @@ class Deltas(NamedTuple):
     resting: Change
 
 
-def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, "p"] | None = None) -> State:
+def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, " p"] | None = None) -> RolloutState:
     """The state in which nothing has been learned: simulated positions, initial look."""
     active, resting = _seen(history.active(frame), visible), _seen(history.resting(frame), visible)
     like = history.positions
-    return State(
+    return RolloutState(
         frame,
         active,
         like.new_zeros(len(active), 3),
@@ -93,13 +93,13 @@ def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, "p"] |
 
 
 def advance(
-    state: State,
+    state: RolloutState,
     history: ParticleHistory,
     look: InitialLook,
     field: DynamicsField,
-    visible: Bool[Tensor, "p"] | None = None,
+    visible: Bool[Tensor, " p"] | None = None,
     flow: VelocityField | None = None,
-) -> tuple[State, Deltas]:
+) -> tuple[RolloutState, Deltas]:
     """The state one frame later.
 
     Args:
@@ -136,7 +136,7 @@ def advance(
         resting_delta = field.collided(history.rest_positions[rest], frame, lying)
         resting = accumulate(look.collided_at(history, frame, rest), state.resting_change, resting_delta)
 
-    return State(
+    return RolloutState(
         frame,
         fresh.active,
         _placed(fresh.offset, stay, offset + delta.velocity),
@@ -153,21 +153,21 @@ def turned(quats: Float[Tensor, "n 4"], rotation: Float[Tensor, "n 3"]) -> Float
     return roma.quat_xyzw_to_wxyz(roma.quat_product(roma.quat_wxyz_to_xyzw(quats), step))
 
 
-def fading(history: ParticleHistory, frame: int, ids: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+def fading(history: ParticleHistory, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Factor on what active particles have learned: 1 in free flight, falling to 0 at the frame of contact."""
     left = (history.ends[ids] - 1 - frame).to(history.positions) / LANDING_FRAMES
     return torch.where(history.collided[ids], left.clamp(0, 1), 1.0)
 
 
-def _seen(ids: Int[Tensor, "n"], visible: Bool[Tensor, "p"] | None) -> Int[Tensor, "k"]:
+def _seen(ids: Int[Tensor, " n"], visible: Bool[Tensor, " p"] | None) -> Int[Tensor, " k"]:
     return ids if visible is None else ids[visible[ids]]
 
 
-def _placed(into: Tensor, where: Bool[Tensor, "n"], values: Tensor) -> Tensor:
+def _placed(into: Tensor, where: Bool[Tensor, " n"], values: Tensor) -> Tensor:
     if values.shape[0] == into.shape[0]:
         return values
     return into.index_copy(0, where.nonzero()[:, 0], values)
 
 
-def _placed_change(into: Change, where: Bool[Tensor, "n"], values: Change) -> Change:
+def _placed_change(into: Change, where: Bool[Tensor, " n"], values: Change) -> Change:
     return Change(*(_placed(a, where, b) for a, b in zip(into, values, strict=True)))

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 MOST_BYTES = 50e6
 PER_CELL = 4  # particles in the air in a cell, on average: fewer, and the grid keeps their own fall speeds instead of the flow
@@ -131,7 +131,7 @@ class VelocityField:
             values = values + around.gather(step - around.read(values), nodes) / mass
         return values[self._nearest(empty)]
 
-    def _nearest(self, empty: Bool[Tensor, "m"]) -> Int[Tensor, "m"]:
+    def _nearest(self, empty: Bool[Tensor, " m"]) -> Int[Tensor, " m"]:
         """For each node the nearest that is not empty: itself, where it is not."""
         grid = empty.reshape(self.shape).numpy(force=True)
         x, y, z = distance_transform_edt(grid, return_distances=False, return_indices=True)  # type: ignore[misc]

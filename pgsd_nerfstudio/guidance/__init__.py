@@ -2,10 +2,10 @@
 
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, Distilled, DistilledClip, distill, distill_clip
 from pgsd_nerfstudio.guidance.folder import PriorError
-from pgsd_nerfstudio.guidance.prior import VideoPrior
 from pgsd_nerfstudio.guidance.prompts import Prompts, embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, WeightDecay, Weighting, regularization_scale
 from pgsd_nerfstudio.guidance.variants import Embeddings, Omega, Role, Variant, roles_of
+from pgsd_nerfstudio.guidance.video_prior import VideoPrior
 from pgsd_nerfstudio.guidance.wan import WanPrior
 
 __all__ = [

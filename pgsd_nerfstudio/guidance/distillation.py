@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.guidance.prior import VideoPrior
 from pgsd_nerfstudio.guidance.variants import (
     ASKED,
     Embeddings,
@@ -32,6 +31,7 @@ from pgsd_nerfstudio.guidance.variants import (
     require_roles,
     rule_at,
 )
+from pgsd_nerfstudio.guidance.video_prior import VideoPrior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ class DistillationConfig:
 class Denoiser(Protocol):
     """What distillation needs of a video prior."""
 
-    alphas_cumprod: Float[Tensor, "steps"]
+    alphas_cumprod: Float[Tensor, " steps"]
 
     def predict_v(self, noisy: Tensor, timestep: int, text_embeddings: Tensor) -> Tensor: ...
 

@@ -72,7 +72,7 @@ class PromptEncoder:
             )
         return embeddings
 
-    def _embedding(self, encoder: Any, ids: Int[Tensor, "l"]) -> Float[Tensor, "l d"]:
+    def _embedding(self, encoder: Any, ids: Int[Tensor, " l"]) -> Float[Tensor, "l d"]:
         """As in CogVideoX' pipeline: padded to full length, and the padding attends and is attended to."""
         return encoder(ids[None])[0][0]
 

@@ -25,8 +25,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance.folder import PriorError, read_config
-from pgsd_nerfstudio.guidance.prior import SMALL, VideoPrior, freeze, usable
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
+from pgsd_nerfstudio.guidance.video_prior import SMALL, VideoPrior, freeze, usable
 from pgsd_nerfstudio.guidance.wan_parts import WanPromptEncoder, find_wan, read_transformer, recompute_blocks
 
 NATIVE = (81, 480, 832)
@@ -40,7 +40,7 @@ def alpha_bar(sigma: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     return (1 - sigma) ** 2 / ((1 - sigma) ** 2 + sigma**2)
 
 
-def v_from_flow(flow: Float[Tensor, "b *s"], noisy: Float[Tensor, "1|b *s"], sigma: float) -> Float[Tensor, "b *s"]:
+def v_from_flow(flow: Float[Tensor, " b *s"], noisy: Float[Tensor, " 1|b *s"], sigma: float) -> Float[Tensor, " b *s"]:
     """v = (1 - 2 sigma) x_t + n u, of the flow u that was predicted at y = n x_t, with `noisy` = x_t."""
     return (1 - 2 * sigma) * noisy + math.hypot(1 - sigma, sigma) * flow
 

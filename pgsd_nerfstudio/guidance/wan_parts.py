@@ -118,7 +118,7 @@ class WanPromptEncoder(PromptEncoder):
     def __call__(self, texts: Sequence[str]) -> Float[Tensor, "n l d"]:
         return super().__call__(texts if isinstance(texts, str) else [cleaned(text) for text in texts])
 
-    def _embedding(self, encoder: Any, ids: Int[Tensor, "l"]) -> Float[Tensor, "l d"]:
+    def _embedding(self, encoder: Any, ids: Int[Tensor, " l"]) -> Float[Tensor, "l d"]:
         said = ids != encoder.config.pad_token_id
         return torch.where(said[:, None], encoder(ids[None], said[None].long())[0][0], 0)
 

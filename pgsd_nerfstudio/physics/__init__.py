@@ -1,10 +1,10 @@
 """What moves: reference trajectories of weather particles, the motion prior."""
 
+from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Clock, Domain, domain_of
-from pgsd_nerfstudio.physics.history import ParticleHistory, Window
-from pgsd_nerfstudio.physics.prior import motion_prior, summary
-from pgsd_nerfstudio.physics.simulate import MAX_PARTICLES, simulate
-from pgsd_nerfstudio.physics.wind import WindField
+from pgsd_nerfstudio.physics.metric import MAX_PARTICLES, simulate_metric
+from pgsd_nerfstudio.physics.motion_prior import motion_prior, summary
+from pgsd_nerfstudio.physics.record.history import ParticleHistory, Window
 
 __all__ = [
     "MAX_PARTICLES",
@@ -15,6 +15,6 @@ __all__ = [
     "Window",
     "domain_of",
     "motion_prior",
-    "simulate",
+    "simulate_metric",
     "summary",
 ]

@@ -1,4 +1,4 @@
-"""One training clip: roll out, render, ask the guide, and carry its gradient back frame by frame.
+"""One training clip: roll out, render, ask the distiller, and carry its gradient back frame by frame.
 
 The gradient on the pixels comes first, from a clip rendered without a graph. Then each frame is rendered again and
 differentiated by itself, so that at no time there is a graph over all frames; what reaches the Gaussians of the roll-out goes
@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pgsd_nerfstudio.physics.history import ParticleHistory
-from pgsd_nerfstudio.plugin.stage import Stage
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.rendering.moment import Moment
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -28,38 +28,38 @@ BLUR = 3  # pixels, for the rasterizer's blur
 
 
 class Stopwatch:
-    """Seconds by stage of one step."""
+    """Seconds of each part of one step."""
 
     def __init__(self, device: torch.device) -> None:
         self.seconds: dict[str, float] = {}
         self._wait: Callable[[], object] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
 
     @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
+    def __call__(self, part: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
         self._wait()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+        self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
 
 
-def seen_by(stage: Stage, cameras: Cameras, history: ParticleHistory, start: int) -> Bool[Tensor, "p"]:
+def seen_by(prepared: PreparedScene, cameras: Cameras, history: ParticleHistory, start: int) -> Bool[Tensor, " p"]:
     """Particles that appear in at least one picture of the clip that starts at frame `start`, in the simulated motion."""
     seen = torch.zeros(len(history), dtype=torch.bool, device=history.device)
     stop = start + len(cameras)
     window = history.window(start, stop)
-    inside = torch.stack([_inside(stage, cameras[k], window.positions[:, k]) for k in range(len(cameras))], dim=1)
+    inside = torch.stack([_inside(prepared, cameras[k], window.positions[:, k]) for k in range(len(cameras))], dim=1)
     seen[window.ids[(inside & window.active).any(1)]] = True
     resting = history.resting(stop - 1)
     at_rest = history.rest_positions[resting]
     for k in range(len(cameras)):
-        seen[resting[_inside(stage, cameras[k], at_rest)]] = True
+        seen[resting[_inside(prepared, cameras[k], at_rest)]] = True
     return seen
 
 
-def _inside(stage: Stage, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+def _inside(prepared: PreparedScene, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     viewmat, K = camera.viewmats[0].to(metres), camera.Ks[0].to(metres)
-    slack = SLACK / stage.scene.frame.metres_per_unit
-    local = stage.scene.frame.to_scene(metres) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    slack = SLACK / prepared.scene.frame.metres_per_unit
+    local = prepared.scene.frame.to_scene(metres) @ viewmat[:3, :3].T + viewmat[:3, 3]
     x, y, z = local.unbind(1)
     right, left = (camera.width + BLUR - K[0, 2]) / K[0, 0], (-BLUR - K[0, 2]) / K[0, 0]
     below, above = (camera.height + BLUR - K[1, 2]) / K[1, 1], (-BLUR - K[1, 2]) / K[1, 1]
@@ -68,7 +68,7 @@ def _inside(stage: Stage, camera: Cameras, metres: Float[Tensor, "n 3"]) -> Bool
 
 
 def render_clip(
-    stage: Stage,
+    prepared: PreparedScene,
     cameras: Cameras,
     weather: Sequence[Gaussians],
     background: Float[Tensor, "3"],
@@ -76,11 +76,11 @@ def render_clip(
 ) -> Float[Tensor, "t 3 h w"]:
     """The clip in 0..1, without a graph."""
     with torch.no_grad():
-        return stage.clip_rasterizer.render(cameras, weather, background, moments).rgb.permute(0, 3, 1, 2).clamp(0, 1)
+        return prepared.clip_rasterizer.render(cameras, weather, background, moments).rgb.permute(0, 3, 1, 2).clamp(0, 1)
 
 
 def surrogate(
-    stage: Stage,
+    prepared: PreparedScene,
     cameras: Cameras,
     weather: Sequence[Gaussians],  # one set a frame, with the graph of the roll-out
     background: Float[Tensor, "3"],
@@ -97,7 +97,7 @@ def surrogate(
         if not names:
             continue
         leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
-        picture = stage.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background, moments[k]).rgb[0]
+        picture = prepared.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background, moments[k]).rgb[0]
         found = torch.autograd.grad(picture, list(leaves.values()), gradient[k].permute(1, 2, 0), allow_unused=True)
         for name, on_leaf in zip(names, found, strict=True):
             if on_leaf is not None:

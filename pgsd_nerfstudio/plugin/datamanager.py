@@ -16,8 +16,8 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch import Tensor
 
 from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.prepared_scene import prepare_scene
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
-from pgsd_nerfstudio.plugin.stage import stage_of
 from pgsd_nerfstudio.plugin.views import Views
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 
@@ -60,11 +60,11 @@ class TrajectoryDataManager(VanillaDataManager):
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
         self.includes_time = True
-        self.stage = stage_of(config.options, device)
-        count = len(self.stage.scene.cameras)
-        self.train_dataset = Views(self.stage, list(range(count)))
+        self.prepared = prepare_scene(config.options, device)
+        count = len(self.prepared.scene.cameras)
+        self.train_dataset = Views(self.prepared, list(range(count)))
         chosen = torch.linspace(0, count - 1, min(EVAL_VIEWS, count)).round().long()
-        self.eval_dataset = Views(self.stage, chosen.tolist())
+        self.eval_dataset = Views(self.prepared, chosen.tolist())
         self.train_dataparser_outputs = self.train_dataset._dataparser_outputs
         DataManager.__init__(self)
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(input_dataset=self.eval_dataset, device=device)
@@ -89,7 +89,7 @@ class TrajectoryDataManager(VanillaDataManager):
         return self.eval_dataloader.get_camera(step % len(self.eval_dataset))
 
     def _trajectory(self, step: int, seed: int) -> tuple[NerfstudioCameras, dict[str, Any]]:
-        options, views = self.config.options, self.stage.scene.cameras
+        options, views = self.config.options, self.prepared.scene.cameras
         frames, height, width = options.clip_frames, options.clip_height, options.clip_width
         if frames is None or height is None or width is None:
             raise RuntimeError("the clip's size is not known before the video prior is opened")
@@ -116,7 +116,7 @@ class TrajectoryDataManager(VanillaDataManager):
         return self.config.run_folder or Path()
 
 
-def partners(views: Cameras, first: int, nearest: int | None) -> Int[Tensor, "n"]:
+def partners(views: Cameras, first: int, nearest: int | None) -> Int[Tensor, " n"]:
     """Views to which a trajectory from view `first` may lead: all others, or the nearest in place and direction."""
     c2w = views.opengl()
     away = (c2w[:, :3, 3] - c2w[first, :3, 3]).norm(dim=1)

@@ -22,20 +22,20 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from pgsd_nerfstudio.dynamics import Deformation, DeformedCloud, DynamicsField, LearnedLook, Rollout
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.effects import InitialLook, initial_look
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
+from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.splat import splat_tensors
-from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.response.answer import Answer, Shown, baked
 from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather import InitialLook, initial_look
 
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
 STRIDE = 8  # frames between kept states: a jump in time, and what lies in a training clip, costs 3.5 frames on average
@@ -55,22 +55,30 @@ class WeatherModel(SplatfactoModel):
     config: WeatherModelConfig
 
     def __init__(
-        self, *args: Any, stage: Stage, history: ParticleHistory, answer: Answer, exporting: bool = False, **kwargs: Any
+        self,
+        *args: Any,
+        prepared: PreparedScene,
+        history: ParticleHistory,
+        answer: Answer,
+        exporting: bool = False,
+        **kwargs: Any,
     ) -> None:
-        """`stage`, `history` and `answer` stay outside of the module's state; `exporting`: `gauss_params` are asked for in
+        """`prepared`, `history` and `answer` stay outside of the module's state; `exporting`: `gauss_params` are asked for in
         earnest."""
-        self.stage, self.history, self.answer, self.exporting = stage, history, answer, exporting
+        self.prepared, self.history, self.answer, self.exporting = prepared, history, answer, exporting
         super().__init__(*args, **kwargs)
 
     def populate_modules(self) -> None:
         Model.populate_modules(self)  # not splatfacto's, which needs CUDA and downloads weights
         options = self.config.options
         look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
-        look = in_place(look, self.history, self.answer, self.stage.scene.frame.to_metric(self.stage.scene.gaussians.means))
+        look = in_place(
+            look, self.history, self.answer, self.prepared.scene.frame.to_metric(self.prepared.scene.gaussians.means)
+        )
         self.look = LearnedLook().to(self.history.device)
         self.field, self.rollout = self._moving(look)
         self._refreshed: dict[str, Tensor] | None = None
-        self.weather = Panel(self.stage.scene, options.seconds)
+        self.weather = Panel(self.prepared.scene, options.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
         self._untimed = 0
@@ -125,7 +133,7 @@ class WeatherModel(SplatfactoModel):
     def weather_at(self, frame: int) -> Gaussians:
         """The weather's Gaussians in scene units at a frame of its time line, learned refinements included."""
         with torch.no_grad(), uninterrupted():
-            return self.stage.scene.frame.gaussians_to_scene(self.rollout.gaussians(frame))
+            return self.prepared.scene.frame.gaussians_to_scene(self.rollout.gaussians(frame))
 
     def moment(self, frame: int, answer: Answer | None = None) -> Shown | None:
         """How the frozen scene looks at a frame; None: as it was trained."""
@@ -164,7 +172,7 @@ class WeatherModel(SplatfactoModel):
         frame: int = 0,
     ) -> Rendering:
         """One view of the scene with some weather or none, and with its answer at a frame or as it was trained; no gradient."""
-        rasterizer = self.stage.rasterizer
+        rasterizer = self.prepared.rasterizer
         with torch.no_grad(), uninterrupted():
             if box is not None:
                 inside, rasterizer = self._inside(box)
@@ -177,7 +185,7 @@ class WeatherModel(SplatfactoModel):
         """Which of the frozen scene lies in the viewer's crop box, and its rasterizer; the last one is kept."""
         key = [tuple(t.flatten().tolist()) for t in (box.R, box.T, box.S)]
         if self._cropped is None or self._cropped[0] != key:
-            frozen = self.stage.rasterizer.frozen
+            frozen = self.prepared.rasterizer.frozen
             inside = box.within(frozen.means).reshape(-1)
             self._cropped = (key, inside, choose_rasterizer(frozen.select(inside), self.device))
         return self._cropped[1:]
@@ -198,14 +206,14 @@ class WeatherModel(SplatfactoModel):
         }
 
     @property
-    def gauss_params(self) -> dict[str, Float[Tensor, n * k]]:  # type: ignore[override]
+    def gauss_params(self) -> dict[str, Float[Tensor, "..."]]:  # type: ignore[override]
         """What ns-export writes, as splatfacto's tensors: the scene with the weather of the moment `export_time`.
 
         A viewer, which only marks the centres with a hidden cloud of points, gets the frozen scene alone.
         """
         if self._exported is None:
             frame = self.frame_at(self.config.options.export_time)
-            frozen, weather = self.stage.scene.gaussians, Gaussians.empty()
+            frozen, weather = self.prepared.scene.gaussians, Gaussians.empty()
             if self.exporting:
                 weather = self.weather_at(frame).to("cpu")
                 frozen = baked(self.moment(frame), frozen.to(self.device)).to("cpu")

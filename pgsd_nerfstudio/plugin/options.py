@@ -19,13 +19,13 @@ import tyro
 
 from pgsd_nerfstudio import __version__
 from pgsd_nerfstudio.dynamics import FieldConfig, RegularizationWeights
+from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.effects.knobs import Knobs
+from pgsd_nerfstudio.effects.language_model import Understanding
+from pgsd_nerfstudio.effects.request import Request
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig
 from pgsd_nerfstudio.guidance.schedules import Weighting
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.weather.asking import Granted
-from pgsd_nerfstudio.weather.effect import Effect
-from pgsd_nerfstudio.weather.knobs import Knobs
-from pgsd_nerfstudio.weather.wish import Wish
 
 CUDA = torch.cuda.is_available()
 
@@ -207,7 +207,7 @@ class WeatherOptions(Knobs, SceneOptions):
         return self._effect_and_remarks()[0]
 
     def remarks(self) -> list[str]:
-        """How the words for the weather were read, and what cannot be granted; raises as `chosen_effect`."""
+        """How the words for the weather were read, and what cannot be done; raises as `chosen_effect`."""
         return self._effect_and_remarks()[1]
 
     def understand(self) -> None:
@@ -225,19 +225,19 @@ class WeatherOptions(Knobs, SceneOptions):
             **self._words(),
             "by": asked.by,
             "remark": asked.remark,
-            "wish": json.loads(asked.wish.to_json()),
+            "request": json.loads(asked.request.to_json()),
         }
 
     def _effect_and_remarks(self) -> tuple[Effect, list[str]]:
         with _refusing():
             return self.turned(self._understood() or self.asked())
 
-    def _understood(self) -> Granted | None:
+    def _understood(self) -> Understanding | None:
         """What is kept, if it is of the same words and reader."""
         kept = self.understood
         if kept is None or any(kept.get(name) != value for name, value in self._words().items()):
             return None
-        return Granted(wish=Wish.from_json(json.dumps(kept["wish"])), by=kept["by"], remark=kept["remark"])
+        return Understanding(request=Request.from_json(json.dumps(kept["request"])), by=kept["by"], remark=kept["remark"])
 
     def _words(self) -> dict[str, str | None]:
         return {name: getattr(self, name) for name in ("weather", "llm", "llm_url")}

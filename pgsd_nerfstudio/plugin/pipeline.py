@@ -26,8 +26,8 @@ from pgsd_nerfstudio.guidance.distillation import DistilledClip
 from pgsd_nerfstudio.guidance.schedules import regularization_scale
 from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surrogate
 from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig
+from pgsd_nerfstudio.plugin.distiller import Distiller, open_prior
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.guide import Guide, open_prior
 from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig, fidelity
 from pgsd_nerfstudio.plugin.motion import prepare_motion, stored_motion
 from pgsd_nerfstudio.plugin.options import WeatherOptions
@@ -56,7 +56,7 @@ class WeatherPipelineConfig(VanillaPipelineConfig):
 
 
 class WeatherPipeline(VanillaPipeline):
-    """Stage, motion prior, model and, in training, the guide."""
+    """PreparedScene, motion prior, model and, in training, the distiller."""
 
     config: WeatherPipelineConfig
     datamanager: TrajectoryDataManager
@@ -83,7 +83,7 @@ class WeatherPipeline(VanillaPipeline):
         self._skipped = self._skipped_in_all = 0
         self._layers_judged = False
         self.config, self.test_mode, self.world_size = config, test_mode, world_size
-        self.guide: Guide | None = None
+        self.distiller: Distiller | None = None
         prior = None
         if grad_scaler is not None:
             # First, since a wrong path there should cost nothing yet.
@@ -94,19 +94,19 @@ class WeatherPipeline(VanillaPipeline):
             device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
         )
         found = stored_motion if prior is None else prepare_motion
-        stage, history, answer = found(self.datamanager.stage, config.options, config.run_folder)
+        prepared, history, answer = found(self.datamanager.prepared, config.options, config.run_folder)
         self._model = config.model.setup(
             scene_box=self.datamanager.train_dataset.scene_box,
             num_train_data=len(self.datamanager.train_dataset),
-            stage=stage,
+            prepared=prepared,
             history=history.to(device),
             answer=answer.to(device),
             exporting=test_mode == "inference",
         )
         self._model.to(device)
         if prior is not None:
-            self.guide = Guide.listening(prior, config.options, stage.scene.description)
-            print_summary(console, config.options, stage, history, self.guide)
+            self.distiller = Distiller.listening(prior, config.options, prepared.scene.description)
+            print_summary(console, config.options, prepared, history, self.distiller)
 
     @property
     def model(self) -> WeatherModel:
@@ -125,34 +125,34 @@ class WeatherPipeline(VanillaPipeline):
         Raises:
             RunError: the video prior's predictions are not finite, several steps in a row.
         """
-        if self.guide is None:
+        if self.distiller is None:
             raise RunError("this run was opened to look at, not to train")
         model, options = self.model, self.config.options
-        stage, watch = model.stage, Stopwatch(model.stage.device)
+        prepared, watch = model.prepared, Stopwatch(model.prepared.device)
         cameras, batch = self.datamanager.next_train(step)
         views, start = from_nerfstudio(cameras), int(batch["start"])
-        background = model.background_color.to(stage.device)
+        background = model.background_color.to(prepared.device)
         model.go_on()
         if step % options.refresh_every == 0:
             with watch("refresh"):
                 model.rollout.refresh()
         with watch("roll-out"):
             # What is deformed is not where it was scattered.
-            seen = None if options.motion == "deformation" else seen_by(stage, views, model.history, start)
+            seen = None if options.motion == "deformation" else seen_by(prepared, views, model.history, start)
             how = {"begin": options.begin, "gradient_frames": options.gradient_frames}
             rolled = model.rollout.window(start, len(views), visible=seen, **how)
-            weather = [stage.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
+            weather = [prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
             answering = options.answering_clips
             moments = [model.moment(start + k) if answering else None for k in range(len(views))]
-            clip = render_clip(stage, views, weather, background, moments)
-        if stage.clip_rasterizer is not stage.rasterizer and not self._layers_judged:
-            exact = replace(stage, clip_rasterizer=stage.rasterizer)
+            clip = render_clip(prepared, views, weather, background, moments)
+        if prepared.clip_rasterizer is not prepared.rasterizer and not self._layers_judged:
+            exact = replace(prepared, clip_rasterizer=prepared.rasterizer)
             self._judge_layers(clip, render_clip(exact, views, weather, background, moments))
         with watch("video prior"):
             distilled = self._distilled(clip, step)
         with watch("render, backward"):
-            video, norms = surrogate(stage, views, weather, background, moments, distilled.gradient)
+            video, norms = surrogate(prepared, views, weather, background, moments, distilled.gradient)
         with watch("regularize"):
             terms = regularization(rolled, model.look, options.regularization.form)
             scale = regularization_scale(options.weights, distilled.loss, step, options.training_steps)
@@ -169,7 +169,7 @@ class WeatherPipeline(VanillaPipeline):
             "timestep": distilled.timestep,
             "drift_m": metres,
             "skipped": self._skipped_in_all,
-            "memory_mb": _memory(stage.device),
+            "memory_mb": _memory(prepared.device),
             **{f"weight/{name}": weights.scaled(name, scale) for name in terms},
             "particles_seen": len(model.history) if seen is None else int(seen.sum()),
             **{f"gradient/{name}": norm for name, norm in norms.items()},
@@ -178,10 +178,10 @@ class WeatherPipeline(VanillaPipeline):
         return {}, losses, {name: torch.tensor(float(value)) for name, value in metrics.items()}
 
     def _distilled(self, clip: Tensor, step: int) -> DistilledClip:
-        """The guide's answer; a single one that is not finite counts as none."""
-        assert self.guide is not None
+        """The distiller's answer; a single one that is not finite counts as none."""
+        assert self.distiller is not None
         try:
-            distilled = self.guide.gradient(clip, step)
+            distilled = self.distiller.gradient(clip, step)
         except FloatingPointError as error:
             self._skipped += 1
             self._skipped_in_all += 1
@@ -228,7 +228,7 @@ class WeatherPipeline(VanillaPipeline):
         there are some), how much the weather changes of the pictures, pictures per second; and the drift of the motion."""
         self.eval()
         model, rows = self.model, []
-        photographs = bool(model.stage.scene.images)
+        photographs = bool(model.prepared.scene.images)
         for index, (camera, batch) in enumerate(self.datamanager.fixed_indices_eval_dataloader):
             began = time.perf_counter()
             snowed = model.get_outputs_for_camera(camera)["rgb"]

@@ -58,7 +58,7 @@ class WeatherTrainer(Trainer):
                 )
             raise
         config = self.config.get_base_dir() / "config.yml"
-        stage: Any = self.pipeline.model.stage
+        prepared: Any = self.pipeline.model.prepared
         for begin, gap in self.pipeline.drift_gaps().items():
             writer.put_scalar(f"gap/{begin}_m", gap.difference, self.config.max_num_iterations)
             CONSOLE.print(
@@ -67,7 +67,7 @@ class WeatherTrainer(Trainer):
                 soft_wrap=True,
             )
         writer.write_out_storage()
-        CONSOLE.print(f"Frozen scene while training: {stage.clip_rasterizer.memory}", soft_wrap=True)
+        CONSOLE.print(f"Frozen scene while training: {prepared.clip_rasterizer.memory}", soft_wrap=True)
         CONSOLE.print(f"Look at it: ns-viewer --load-config {config}", soft_wrap=True)
         CONSOLE.print(f"A video: ns-render interpolate --load-config {config} --output-path snow.mp4", soft_wrap=True)
 

@@ -12,8 +12,8 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
+from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
-from pgsd_nerfstudio.plugin.stage import Stage
 from pgsd_nerfstudio.storage import cache_dir
 
 
@@ -23,14 +23,14 @@ class Views(InputDataset):
     Where the scene has no photographs, each view is rendered when it is first asked for and kept as a picture in the cache.
     """
 
-    def __init__(self, stage: Stage, indices: list[int]) -> None:
-        self.stage, self.indices = stage, indices
-        super().__init__(view_outputs(stage, indices))
+    def __init__(self, prepared: PreparedScene, indices: list[int]) -> None:
+        self.prepared, self.indices = prepared, indices
+        super().__init__(view_outputs(prepared, indices))
 
     def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "h w 3"]:
         """The picture in the size of its camera: the photograph, or the frozen scene."""
         path = self.image_filenames[image_idx]
-        size = (self.stage.scene.cameras.width, self.stage.scene.cameras.height)
+        size = (self.prepared.scene.cameras.width, self.prepared.scene.cameras.height)
         if not path.is_file():
             picture = Image.fromarray(self._render(self.indices[image_idx]))
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,13 +43,13 @@ class Views(InputDataset):
 
     def _render(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         with torch.no_grad():
-            rgb = self.stage.rasterizer.render(self.stage.scene.cameras[index].to(self.stage.device)).rgb[0]
+            rgb = self.prepared.rasterizer.render(self.prepared.scene.cameras[index].to(self.prepared.device)).rgb[0]
         return (rgb.clamp(0, 1) * 255 + 0.5).byte().cpu().numpy()
 
 
-def view_outputs(stage: Stage, indices: list[int]) -> DataparserOutputs:
+def view_outputs(prepared: PreparedScene, indices: list[int]) -> DataparserOutputs:
     """What a dataparser would say of these views; scene units are the run's coordinates, so its transform is the identity."""
-    scene = stage.scene
+    scene = prepared.scene
     if scene.images and all(path.is_file() for path in scene.images):
         names = [scene.images[i] for i in indices]
     else:

@@ -37,7 +37,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator of a kernel for one thread."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        made = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_MATH, **options)(function)
+        made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_MATH, **options)(function)
         # What numba compares with the stamp in its index of compiled functions; it offers no public way to say more.
         made._cache._cache_file._source_stamp = _STAMP
         return made

@@ -36,7 +36,7 @@ class Splats(NamedTuple):
     """Inverse covariances on the image plane, upper triangle."""
     features: Float[Tensor, "m 4"]
     """Red, green, blue and depth."""
-    opacities: Float[Tensor, "m"]
+    opacities: Float[Tensor, " m"]
 
 
 class Sorted(NamedTuple):
@@ -155,7 +155,7 @@ class GsplatRasterizer:
         )
         return [tensor[0] for tensor in found]
 
-    def _opacities(self, gaussians: Gaussians, view: Viewpoint) -> Float[Tensor, "m"]:
+    def _opacities(self, gaussians: Gaussians, view: Viewpoint) -> Float[Tensor, " m"]:
         """Averaged over the exposure; all are in front of the camera."""
         if gaussians.displacements is None:
             return gaussians.opacities
@@ -171,7 +171,7 @@ def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:
     return matrices.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
 
 
-def _intersect(centers: Float[Tensor, "m 2"], radii: Tensor, depths: Float[Tensor, "m"], view: Viewpoint) -> Isects:
+def _intersect(centers: Float[Tensor, "m 2"], radii: Tensor, depths: Float[Tensor, " m"], view: Viewpoint) -> Isects:
     across, down = -(-view.width // TILE), -(-view.height // TILE)
     _, ids, rows = gsplat.isect_tiles(centers[None], radii[None], depths[None], TILE, across, down)
     return Isects(ids, rows, gsplat.isect_offset_encode(ids, 1, across, down))

@@ -15,9 +15,9 @@ from torch import Tensor
 class Isects(NamedTuple):
     """Which Gaussians enter which tiles of one camera, tile by tile and nearest first."""
 
-    ids: Int[Tensor, "e"]
+    ids: Int[Tensor, " e"]
     """int64, ascending."""
-    rows: Int[Tensor, "e"]
+    rows: Int[Tensor, " e"]
     """int32: the Gaussian of each (gsplat: flatten_ids)."""
     offsets: Int[Tensor, "1 tiles_down tiles_across"]
     """int32: where each tile begins."""
@@ -38,5 +38,5 @@ def merge(first: Isects, second: Isects, first_gaussians: int) -> Isects:
     return Isects(ids, rows, first.offsets + second.offsets)
 
 
-def _count_up(ids: Int[Tensor, "e"]) -> Int[Tensor, "e"]:
+def _count_up(ids: Int[Tensor, " e"]) -> Int[Tensor, " e"]:
     return torch.arange(len(ids), device=ids.device)

@@ -23,7 +23,7 @@ from scipy.optimize import root_scalar
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
+Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]]
 """Per scene unit, at points in scene units."""
 
 CLOSEST = 2.0  # pixels between rays, at least: small pictures do not show more
@@ -67,12 +67,12 @@ class Froxels:
 
         return float(root_scalar(excess, bracket=(1e-9, 600 / self.slices)).root)
 
-    def edges(self, like: Tensor) -> Float[Tensor, "s+2"]:
+    def edges(self, like: Tensor) -> Float[Tensor, " s+2"]:
         """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
         within = self.nearest / math.expm1(self.growth) * torch.expm1(self.growth * torch.arange(self.slices + 1).to(like))
         return torch.cat([within, BEYOND * within[-1:]])
 
-    def slots(self, distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def slots(self, distances: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Where distances lie among the edges, linear within each slice, so that even air is met exactly."""
         at = torch.log1p(distances * (math.expm1(self.growth) / self.nearest)) / self.growth
         whole = at.detach().floor()
@@ -145,7 +145,7 @@ class Medium:
         K: Float[Tensor, "3 3"],
         width: int,
         height: int,
-    ) -> Float[Tensor, "n"]:
+    ) -> Float[Tensor, " n"]:
         """The integral of the extinction from the camera's centre to each point; T = exp(-it)."""
         viewmat, K = viewmat.to(means), K.to(means)
         points = means @ viewmat[:3, :3].T + viewmat[:3, 3]

@@ -51,7 +51,7 @@ class Moment(Protocol):
         ...
 
     def frozen_colors(
-        self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], view: Viewpoint
+        self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], view: Viewpoint
     ) -> Float[Tensor, "m 3"]:
         """Colours of the frozen Gaussians `ids`, from their own as this camera sees them; the air in between included."""
         ...

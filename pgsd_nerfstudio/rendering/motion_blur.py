@@ -30,7 +30,7 @@ def stretched_covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
 def dimming(
     covariances: Float[Tensor, "n 2 2"],  # pixels squared, without motion, blur included
     displacements: Float[Tensor, "n 2"],  # pixels
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """sqrt(det S / det S'), what the opacities are multiplied with."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     u, v = displacements.unbind(-1)

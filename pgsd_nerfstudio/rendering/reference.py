@@ -31,8 +31,8 @@ class Projection(NamedTuple):
     """Pixels."""
     covariances: Float[Tensor, "n 2 2"]
     """Pixels squared, blur and motion included."""
-    depths: Float[Tensor, "n"]
-    opacities: Float[Tensor, "n"]
+    depths: Float[Tensor, " n"]
+    opacities: Float[Tensor, " n"]
     """Averaged over the exposure where the Gaussian moves."""
     radii: Float[Tensor, "n 2"]
     """Half sides of the footprint along x and y in whole pixels, 0 where the Gaussian is not drawn."""
@@ -60,13 +60,13 @@ def project_reference(
     return Projection(centers, flat, points[:, 2], opacities, torch.where((drawn & inside)[:, None], radii, 0.0))
 
 
-def _determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n"]:
+def _determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, " n"]:
     return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] ** 2
 
 
 @torch.no_grad()
 def _half_sides(
-    covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, "n"], config: RasterConfig
+    covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"], config: RasterConfig
 ) -> Float[Tensor, "n 2"]:
     """Of the footprint, whole pixels."""
     variances = covariances.diagonal(dim1=1, dim2=2)
@@ -78,7 +78,7 @@ def _half_sides(
     return (sigmas[:, None] * variances.sqrt()).ceil()
 
 
-def _enters(projection: Projection, left: int, top: int) -> Bool[Tensor, "n"]:
+def _enters(projection: Projection, left: int, top: int) -> Bool[Tensor, " n"]:
     """Whether the footprint of each Gaussian touches the tile at (left, top)."""
     corner = torch.tensor([left, top]).to(projection.centers)
     first = torch.floor((projection.centers - projection.radii) / TILE) * TILE

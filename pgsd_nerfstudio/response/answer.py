@@ -15,19 +15,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgsd_nerfstudio.effects.ambience import Ambience
+from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
+from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.exposure import Exposure
-from pgsd_nerfstudio.response.layers import Layers
 from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, under_sky, wetted
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.weather.ambience import Ambience
-from pgsd_nerfstudio.weather.effect import Effect
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.rendering.medium import Medium
     from pgsd_nerfstudio.response.edits import Edits
-    from pgsd_nerfstudio.response.haze import HazeField
+    from pgsd_nerfstudio.response.haze_field import HazeField
 
 FAR = 3000.0  # m: where the sky begins, as far as haze is concerned
 OPAQUE_UNDER = 1.5  # a full layer is as opaque as this many more Gaussians in the same place
@@ -48,8 +48,8 @@ class Answer:
 
     effect: Effect
     exposure: Exposure
-    layers: Layers
-    softening: Float[Tensor, "n"] | None
+    coating: Coating
+    softening: Float[Tensor, " n"] | None
     """Factor on linear light when all of the ambience's clouds have come; None where no sun was found."""
     up: Float[Tensor, "3 3"]
     """Scene axes to metric axes."""
@@ -63,7 +63,7 @@ class Answer:
     def at(self, seconds: float) -> Shown | None:
         """What is seen at a second; None where the scene is still as it was, to the bit."""
         medium = self.haze.at(seconds) if self.haze is not None else None
-        hidden, wet = self.layers.hidden(seconds), self.layers.wet(seconds)
+        hidden, wet = self.coating.hidden(seconds), self.coating.wet(seconds)
         shown = Shown(self, seconds, medium, hidden, wet)
         return shown if shown.changes else None
 
@@ -85,18 +85,18 @@ class Answer:
         return replace(
             self,
             exposure=_mapped(self.exposure, change),
-            layers=_mapped(self.layers, change),
+            coating=_mapped(self.coating, change),
             edits=None if self.edits is None else _mapped(self.edits, change),
             softening=None if self.softening is None else change(self.softening),
             number=next(_numbers),
             **others,
         )
 
-    def share_of_edits(self, seconds: float) -> Float[Tensor, "n"]:
+    def share_of_edits(self, seconds: float) -> Float[Tensor, " n"]:
         """How far each Gaussian has gone towards the edited pictures: as its own layer has grown, elsewhere as the weather."""
-        final, now = self.layers.hidden(self.seconds), self.layers.hidden(seconds)
-        spell = self.effect.spell
-        overall = spell.fallen(seconds) / max(spell.fallen(self.seconds), 1e-9)
+        final, now = self.coating.hidden(self.seconds), self.coating.hidden(seconds)
+        timeline = self.effect.timeline
+        overall = timeline.fallen(seconds) / max(timeline.fallen(self.seconds), 1e-9)
         return torch.where(final > 0.02, now / final.clamp_min(0.02), min(overall, 1.0)).clamp(0, 1)
 
 
@@ -107,8 +107,8 @@ class Shown:
     answer: Answer
     seconds: float
     medium: Medium | None
-    hidden: Float[Tensor, "n"]
-    wet: Float[Tensor, "n"]
+    hidden: Float[Tensor, " n"]
+    wet: Float[Tensor, " n"]
 
     @property
     def key(self) -> bytes:
@@ -124,7 +124,7 @@ class Shown:
     @property
     def share(self) -> float:
         """How much of the weather has come."""
-        return self.answer.effect.spell.share(self.seconds)
+        return self.answer.effect.timeline.share(self.seconds)
 
     def altered(self, frozen: Gaussians) -> Gaussians:
         """Under a layer Gaussians are wider and more opaque; edited pictures say themselves what they are."""
@@ -136,7 +136,7 @@ class Shown:
         return replace(frozen, opacities=opacities, scales=frozen.scales * (1 + WIDER_UNDER * self.hidden[:, None]))
 
     def frozen_colors(
-        self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], view: Viewpoint
+        self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], view: Viewpoint
     ) -> Float[Tensor, "m 3"]:
         towards = torch.nn.functional.normalize(view.center - means, dim=1) @ self.answer.up.T.to(means)
         return self.moving_colors(self.lit(rgb, ids, towards), means, view)
@@ -150,7 +150,7 @@ class Shown:
         far = FAR / self.answer.metres_per_unit
         return self.medium.behind(own, view.viewmat, view.K, view.width, view.height, far)
 
-    def lit(self, rgb: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
+    def lit(self, rgb: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
         """Colours [m, 3] of frozen Gaussians in the light and under the matter of the moment, without air.
 
         Args:
@@ -170,13 +170,13 @@ class Shown:
             return encoded(light)
         return encoded(torch.lerp(light, self._layer(light, ids), self.hidden[ids, None].to(light)))
 
-    def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m 3"]:
+    def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
         """Light of the layer on Gaussians."""
         relief = 1 - RELIEF + RELIEF * (luminance(under)[:, None] / MIDDLE).clamp_max(1.5)
         own = linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
         return own * relief * under_sky(self.answer.exposure.sky[ids].to(under))
 
-    def _in_weather(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, "m"], ambience: Ambience) -> Float[Tensor, "m 3"]:
+    def _in_weather(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], ambience: Ambience) -> Float[Tensor, "m 3"]:
         share = self.share
         factor = 1 + share * (2.0**ambience.stops * torch.tensor(ambience.tint).to(light) - 1)
         light = saturated(light * factor, 1 + share * (ambience.saturation - 1))
@@ -187,7 +187,7 @@ class Shown:
         grey = luminance(light)[:, None]
         return softened * torch.lerp(grey, light, softened.clamp_min(1.0) ** -BLUE_SHADOWS)
 
-    def _mirror(self, ids: Int[Tensor, "m"], towards: Float[Tensor, "m 3"], ambience: Ambience) -> Float[Tensor, "m 3"]:
+    def _mirror(self, ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"], ambience: Ambience) -> Float[Tensor, "m 3"]:
         exposure = self.answer.exposure
         cosine = (exposure.normals[ids].to(towards) * towards).sum(1)
         smooth = SMOOTH * exposure.level[ids].to(towards) ** 2

@@ -139,7 +139,7 @@ class _Views:
     cameras: Cameras
     targets: list[Float[Tensor, "h w 3"]]
     """Half precision, on the CPU."""
-    seen: Bool[Tensor, "n"]
+    seen: Bool[Tensor, " n"]
     """The Gaussians that light up at least SEEN pixels in one of them."""
 
     @staticmethod

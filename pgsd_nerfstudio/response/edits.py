@@ -20,7 +20,7 @@ class Edits:
 
     rgb: Float[Tensor, "n 3"]
     """Added to plain RGB."""
-    logit: Float[Tensor, "n"]
+    logit: Float[Tensor, " n"]
     """Added to the logit of the opacity."""
     log_scale: Float[Tensor, "n 3"]
     """Added to the logarithms of the scales."""
@@ -45,7 +45,7 @@ class Edits:
         """The change of the chosen Gaussians, by mask or by index."""
         return Edits(**{name: tensor[which] for name, tensor in self.tensors.items()})
 
-    def applied(self, gaussians: Gaussians, share: Float[Tensor, "n"] | float) -> Gaussians:
+    def applied(self, gaussians: Gaussians, share: Float[Tensor, " n"] | float) -> Gaussians:
         """The Gaussians with a share of the change, one for all or one for each; differentiable.
 
         Share 0 gives the same values bit for bit, share 1 the look that was fitted. Opacities change by their logits, scales

@@ -17,11 +17,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pgsd_nerfstudio.physics.populations import fall_speed, number_density
+from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.physics.laws.populations import fall_speed, number_density
 from pgsd_nerfstudio.response.rays import blocked, open_sky
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather.effect import Effect
 
 RAYS = 24  # per Gaussian and kind; their noise, a tenth, is less than what neighbours differ by
 NEAR = 0.08  # m: a Gaussian this close to the surface is part of it
@@ -40,13 +40,13 @@ class Exposure:
 
     normals: Float[Tensor, "n 3"]
     """Unit, metric: a flat Gaussian's own, turned to the surface's open side; else the surface's, and away from it up."""
-    loose: Bool[Tensor, "n"]
+    loose: Bool[Tensor, " n"]
     """Away from the surface that is known: foliage, branches, the far background."""
-    catches: Float[Tensor, "n"]
+    catches: Float[Tensor, " n"]
     """Mass that comes down on it relative to what an open horizontal area of the same size catches."""
-    level: Float[Tensor, "n"]
+    level: Float[Tensor, " n"]
     """How well its own plane lies in the surface, 0..1: paving mirrors when it is wet, blades of grass do not."""
-    sky: Float[Tensor, "n"]
+    sky: Float[Tensor, " n"]
     """Share of the sky it sees, weighted by the cosine; 1: an open horizontal surface."""
 
     @staticmethod
@@ -65,7 +65,7 @@ class Exposure:
         return Exposure(normals, loose, catches, level, sky)
 
 
-def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r"]]:
+def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "r 3"], Float[Tensor, " r"]]:
     """Velocities in m/s with which an effect's mass comes down, and the share of each over its fall speed, in s/m.
 
     With them sum(share * -velocity . n) is the mass caught by a surface of normal n, relative to a horizontal one: the
@@ -90,7 +90,7 @@ def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Fl
 
 def _ground(
     metric: Gaussians, surface: SurfaceMesh
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, " n"], Float[Tensor, " n"]]:
     """Where rays of each Gaussian start, its normal, whether it is loose, and how level it lies."""
     up = torch.tensor([0.0, 0.0, 1.0])
     found = surface.closest(metric.means)
@@ -110,7 +110,7 @@ def _ground(
     return starts, torch.where((level > LEVEL)[:, None], turned, normals), loose, level
 
 
-def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor, "n"]:
+def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor, " n"]:
     """Whether the first thing above a point is the back of a surface: then it fills what a camera sees as that surface."""
     hits = surface.cast(points, torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3))
     return torch.isfinite(hits.distance) & (hits.distance < SUNK) & (hits.normal[:, 2] > 0)

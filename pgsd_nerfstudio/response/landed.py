@@ -9,10 +9,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from pgsd_nerfstudio.physics.history import ParticleHistory
+from pgsd_nerfstudio.effects.appearance import InitialLook
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.light import encoded, linear, under_sky
-from pgsd_nerfstudio.weather.appearance import InitialLook
 
 NEIGHBOURS = 8  # frozen Gaussians whose view of the sky is averaged; single ones vary by their rays
 

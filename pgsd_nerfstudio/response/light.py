@@ -31,7 +31,7 @@ def encoded(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return light.clamp_min(0.0) ** (1 / GAMMA)
 
 
-def luminance(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def luminance(light: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Of linear RGB (Rec. 709)."""
     return light @ torch.tensor(LUMINANCE).to(light)
 
@@ -49,7 +49,7 @@ def wetted(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return thick_albedo(((1 - grain) / (1 - WET_ASYMMETRY * grain)).sqrt())
 
 
-def leafy(light: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def leafy(light: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """How much like a leaf a colour is, 0..1, by its excess of green (Woebbecke et al. 1995): wax keeps water out of leaves."""
     red, green, blue = light.unbind(1)
     excess = (2 * green - red - blue) / (red + green + blue).clamp_min(1e-4)
@@ -67,7 +67,7 @@ def similarity(albedo: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     return (half - (half**2 - 4 * 0.139 * (1 - albedo)).sqrt()) / (2 * 0.139)
 
 
-def mirrored(cosine: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+def mirrored(cosine: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Share of unpolarised light that a film of water mirrors, by the cosine of the angle to its normal (Fresnel)."""
     outside = cosine.clamp(0, 1)
     inside = (1 - (1 - outside**2) / WATER**2).sqrt()
@@ -76,7 +76,7 @@ def mirrored(cosine: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return 0.5 * (across**2 + along**2)
 
 
-def under_sky(sky: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+def under_sky(sky: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     """Light on matter that is white by itself, by the share of the overcast sky that it sees; 1 in the open."""
     open_share = sky.clamp(0, 1).sqrt()[:, None]  # a bright surrounding fills in
     return torch.lerp(torch.tensor(SHELTERED).to(sky), torch.ones(3).to(sky), open_share)

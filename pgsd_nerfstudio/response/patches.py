@@ -67,7 +67,7 @@ class Patches:
         modes = (noise / noise.abs() * power.sqrt())[..., :half].to(torch.complex64)
         return Patches(modes, rates[..., :half], PERIOD * size, deviation, wind)
 
-    def density(self, points: Float[Tensor, "n 3"], seconds: float) -> Float[Tensor, "n"]:
+    def density(self, points: Float[Tensor, "n 3"], seconds: float) -> Float[Tensor, " n"]:
         """Relative to the mean, at metric points; on their device, in their dtype."""
         # In float64, so that late seconds stay as exact as the first.
         gone = torch.remainder(torch.tensor(self.wind, dtype=torch.float64) * seconds, self.period)

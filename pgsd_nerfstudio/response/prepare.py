@@ -10,22 +10,22 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer
+from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import LEVEL, Exposure
-from pgsd_nerfstudio.response.haze import HazeField
-from pgsd_nerfstudio.response.layers import Layers
+from pgsd_nerfstudio.response.haze_field import HazeField
 from pgsd_nerfstudio.response.light import linear, luminance
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather.effect import Effect
 
 SOLID = 0.3  # opacity from which a Gaussian's colour is asked for the sun
 NEIGHBOURS = 16
@@ -90,7 +90,7 @@ def composed(
     scene: Scene,
     effect: Effect,
     exposure: Exposure,
-    softening: Float[Tensor, "n"] | None = None,
+    softening: Float[Tensor, " n"] | None = None,
     *,
     seconds: float = 10.0,
     seed: int = 0,
@@ -100,7 +100,7 @@ def composed(
     return Answer(
         effect=effect,
         exposure=exposure,
-        layers=Layers.of(effect, exposure, scene.frame.to_metric(scene.gaussians.means), seed=seed),
+        coating=Coating.of(effect, exposure, scene.frame.to_metric(scene.gaussians.means), seed=seed),
         softening=softening,
         up=scene.frame.rotation,
         metres_per_unit=scene.frame.metres_per_unit,
@@ -135,7 +135,7 @@ def to_metric(scene: Scene) -> Gaussians:
     return scene.frame.gaussians_to_metric(replace(frozen, colors=plain))
 
 
-def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect) -> Float[Tensor, "n"] | None:
+def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect) -> Float[Tensor, " n"] | None:
     """Factor on linear light when the ambience's clouds have come; None where they change nothing or no sun is found."""
     if effect.ambience is None or effect.ambience.clouds == 0:
         return None

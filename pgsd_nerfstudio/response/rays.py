@@ -44,7 +44,7 @@ def open_cosines(
 
 def open_sky(
     starts: Tensor, normals: Tensor, surface: SurfaceMesh, rays: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
     """Open share of the cosine-weighted hemisphere, and its first moment; each point turns the same rays by another angle."""
     side, across = frames(normals)
     turn = 2 * math.pi * torch.rand(len(normals), 1, generator=generator)

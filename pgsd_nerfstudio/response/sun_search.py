@@ -36,24 +36,24 @@ class Yard:
 
     starts: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
-    sky: Float[Tensor, "n"]
+    sky: Float[Tensor, " n"]
     slope: Float[Tensor, "n 3"]
     """Mean direction of the open part of the hemisphere, zero elsewhere: what a gradient of the sky adds."""
-    first: Int[Tensor, "p"]
-    second: Int[Tensor, "p"]
-    differences: Float[Tensor, "p"]
-    cells: Int[Tensor, "p"]
+    first: Int[Tensor, " p"]
+    second: Int[Tensor, " p"]
+    differences: Float[Tensor, " p"]
+    cells: Int[Tensor, " p"]
 
     @property
     def spread(self) -> float:
         return scatter(self.differences)
 
-    def contrast(self, light: Float[Tensor, "n *k"]) -> Float[Tensor, "p *k"]:
+    def contrast(self, light: Float[Tensor, " n *k"]) -> Float[Tensor, " p *k"]:
         """How log light differs between neighbours."""
         log = light.clamp_min(1e-3).log()
         return log[self.first] - log[self.second]
 
-    def by_cell(self, losses: Float[Tensor, "p *k"]) -> Float[Tensor, "cells *k"]:
+    def by_cell(self, losses: Float[Tensor, " p *k"]) -> Float[Tensor, " cells *k"]:
         """Sums over neighbours, relative to the number of all."""
         return torch.zeros(CELLS, *losses.shape[1:]).index_add_(0, self.cells, losses) / len(self.cells)
 
@@ -63,8 +63,8 @@ class Fit(NamedTuple):
 
     ratio: float
     bounce: float
-    ambient: Float[Tensor, "n"]
-    light: Float[Tensor, "n"]
+    ambient: Float[Tensor, " n"]
+    light: Float[Tensor, " n"]
     loss: float
 
 
@@ -94,7 +94,7 @@ def yard_of(
     return Yard(starts, facing, sky, slope, first, second, log[first] - log[second], cells)
 
 
-def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generator: torch.Generator) -> Int[Tensor, "m"]:
+def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generator: torch.Generator) -> Int[Tensor, " m"]:
     """At most one point a cube, in random order; cubes so small that there are enough. Few points are all taken."""
     within = torch.nonzero(((points > bounds[0] - NEAR) & (points < bounds[1] + NEAR)).all(1))[:, 0]
     mixed = within[torch.randperm(len(within), generator=generator)]
@@ -111,7 +111,7 @@ def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generat
     return mixed[torch.from_numpy(np.sort(kept))]
 
 
-def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, "n"]:
+def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, " n"]:
     """Cells of equal numbers of points, halved along their longer side; consecutive ones together make a fold."""
     labels, parts = np.zeros(len(ground), np.int64), [np.arange(len(ground))]
     while len(parts) < CELLS:
@@ -125,7 +125,7 @@ def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, "n"]:
     return torch.from_numpy(labels)
 
 
-def scatter(errors: Float[Tensor, "p"]) -> float:
+def scatter(errors: Float[Tensor, " p"]) -> float:
     """Standard deviation by the median of magnitudes; never zero, as where a scene is of one colour."""
     return max(1.4826 * float(errors.abs().median()), 1e-4)
 
@@ -140,7 +140,7 @@ def _bounded(z: np.ndarray) -> np.ndarray:
     return np.stack([z / (1 + z), (1 + z) ** -2.0, -2 * (1 + z) ** -3.0])
 
 
-def fitted(yard: Yard, cosines: Float[Tensor, "n"], *, width: float, strongest: float) -> Fit:
+def fitted(yard: Yard, cosines: Float[Tensor, " n"], *, width: float, strongest: float) -> Fit:
     """Ratio, bounce and gradient of the sky with the least loss, for one sun; `strongest` = 0: for none."""
     closed = 1 - yard.sky
     shares = torch.cat([cosines[:, None], closed[:, None], yard.slope], dim=1)
@@ -172,7 +172,7 @@ def fitted(yard: Yard, cosines: Float[Tensor, "n"], *, width: float, strongest: 
 
 
 def losses_by_cell(
-    yard: Yard, cosines: Float[Tensor, "n d"], ambient: Float[Tensor, "n"], width: float
+    yard: Yard, cosines: Float[Tensor, "n d"], ambient: Float[Tensor, " n"], width: float
 ) -> Float[Tensor, "d ratios cells"]:
     """How badly each sun at each ratio foretells the differences."""
     ratios, losses = torch.tensor(RATIOS), []
@@ -212,7 +212,7 @@ def search(yard: Yard, surface: SurfaceMesh, width: float) -> tuple[Float[Tensor
     return directions, cosines, best
 
 
-def foretold_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, "cells"]:
+def foretold_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, " cells"]:
     """Losses by cell of the sun, and ratio, that is best without the cell's fold."""
     choices = losses.flatten(0, 1)
     folds = choices.reshape(len(choices), FOLDS, CELLS // FOLDS)
@@ -220,7 +220,7 @@ def foretold_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, "c
     return folds[chosen, torch.arange(FOLDS)].flatten()
 
 
-def standard_errors(gains: Float[Tensor, "cells"]) -> float:
+def standard_errors(gains: Float[Tensor, " cells"]) -> float:
     """The mean in units of its standard error."""
     return float(gains.mean() / (gains.std() / math.sqrt(len(gains))).clamp_min(1e-12))
 

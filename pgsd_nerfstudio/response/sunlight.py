@@ -63,7 +63,7 @@ class Sunlight:
 def find_sunlight(
     points: Float[Tensor, "n 3"],  # m
     normals: Float[Tensor, "n 3"],  # unit, towards the open side
-    luminance: Float[Tensor, "n"],  # linear light, not sRGB; any scale
+    luminance: Float[Tensor, " n"],  # linear light, not sRGB; any scale
     surface: SurfaceMesh,
     *,
     seed: int = 0,
@@ -99,7 +99,9 @@ def find_sunlight(
     return Sunlight((x, y, z), fit.ratio, fit.bounce, explained, certainty)
 
 
-def lit(sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Float[Tensor, "n"]:
+def lit(
+    sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], surface: SurfaceMesh
+) -> Float[Tensor, " n"]:
     """Share of the sun's disc that points (m) see, times the cosine to their normals (unit): 0..1, soft over two degrees."""
     place, normals = ray_starts(points, normals, surface), normals.detach().float().cpu()
     toward = torch.tensor(sun.direction)
@@ -109,7 +111,9 @@ def lit(sun: Sunlight, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3
     return cosines.mean(1).to(points)
 
 
-def overcast_factor(sun: Sunlight, lit: Float[Tensor, "n"], sky_seen: Float[Tensor, "n"], clouds: float) -> Float[Tensor, "n"]:
+def overcast_factor(
+    sun: Sunlight, lit: Float[Tensor, " n"], sky_seen: Float[Tensor, " n"], clouds: float
+) -> Float[Tensor, " n"]:
     """What linear light is multiplied with when `clouds` (0..1) of the direct sun reach the ground as sky light instead.
 
     Open level ground keeps its light, and so does what surfaces throw at each other; `lit` as the function of this

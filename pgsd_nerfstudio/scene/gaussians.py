@@ -24,7 +24,7 @@ class Gaussians:
     """Rotations as wxyz quaternions; consumers normalise."""
     scales: Float[Tensor, "n 3"]
     """Standard deviations along the three axes, same units as the means."""
-    opacities: Float[Tensor, "n"]
+    opacities: Float[Tensor, " n"]
     """Peak opacities, 0..1."""
     colors: Tensor
     """[N, 3] plain RGB in 0..1, or [N, K, 3] spherical harmonics with K = (degree + 1)^2, as in splatfacto."""
@@ -68,7 +68,7 @@ class Gaussians:
     def detach(self) -> Gaussians:
         return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors.items()})
 
-    def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> Gaussians:
+    def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Gaussians:
         """The chosen Gaussians, by mask or by index."""
         return Gaussians(**{name: tensor[which] for name, tensor in self.tensors.items()})
 

@@ -78,7 +78,7 @@ class DistanceGrid:
         """Last lattice point, metres."""
         return self.lower + self.cell * (np.array(self.values.shape) - 1)
 
-    def sample(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, "n"], Float[ndarray, "n 3"]]:
+    def sample(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
         """Distance in metres at points, interpolated between eight lattice points, and its gradient, which points outwards.
 
         Beyond the box the nearest point of the box is taken. The gradient is short or zero beyond the band.
@@ -103,7 +103,7 @@ class DistanceGrid:
 
 def _near(
     surface: SurfaceMesh, lower: Float[ndarray, "3"], shape: tuple[int, ...], cell: float, reach: float
-) -> tuple[Int[ndarray, "n 3"], Float[ndarray, "n"], int]:
+) -> tuple[Int[ndarray, "n 3"], Float[ndarray, " n"], int]:
     """Lattice points within `reach` metres of the surface, their distances, and how many points were asked."""
     scene, asked = surface.raycasting, 0
     edge = 8
@@ -150,7 +150,7 @@ def _sides(
     return sides
 
 
-def _by_crossings(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> tuple[Bool[ndarray, "n"], Bool[ndarray, "n"]]:
+def _by_crossings(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> tuple[Bool[ndarray, " n"], Bool[ndarray, " n"]]:
     """Which points are inside by the parity of crossings, and which are not but see no sky either."""
     odd, sky = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for direction in _upward(RAYS):
@@ -162,7 +162,7 @@ def _by_crossings(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> tuple[
     return hidden & (odd > RAYS / 2), hidden & (odd <= RAYS / 2)
 
 
-def _facing(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+def _facing(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
     """Mean over the rays: +1 where the first triangle that is met shows its front, -1 where its back."""
     total = np.zeros(len(points), np.float32)
     for direction in _upward(RAYS):

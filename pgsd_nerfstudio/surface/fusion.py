@@ -41,11 +41,11 @@ class Fusion:
     """A component of the mesh whose bounding box is shorter than this many voxels is noise, and removed."""
 
 
-Region = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
+Region = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 """Signed distance in metres of points to the border of what is wanted; negative inside."""
 
 
-def everywhere(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def everywhere(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """The region without a border."""
     return np.full(len(points), -np.inf, points.dtype)
 

@@ -38,7 +38,7 @@ MAX_TRIANGLES = {"near": 330_000, "far": 70_000}
 class Hits(NamedTuple):
     """Where rays first meet the surface."""
 
-    distance: Float[Tensor, "n"]
+    distance: Float[Tensor, " n"]
     """In lengths of the ray's direction: metres for unit directions, 0..1 along a displacement. inf where nothing is hit."""
     normal: Float[Tensor, "n 3"]
     """Unit normals of the open side; zero where nothing is hit."""
@@ -50,7 +50,7 @@ class Closest(NamedTuple):
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
     """Unit normals of the open side."""
-    distance: Float[Tensor, "n"]
+    distance: Float[Tensor, " n"]
     """Metres, never negative; inf where the mesh is empty."""
 
 

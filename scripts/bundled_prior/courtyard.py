@@ -15,15 +15,15 @@ from torch import Tensor
 
 from bundled_prior.families import FRAMES, HEIGHT, WIDTH, Family, draw_looks
 from bundled_prior.looks import DEMO_SCENE, Look
-from pgsd_nerfstudio.physics import Clock, ParticleHistory, simulate
+from pgsd_nerfstudio.effects import effect, initial_look
+from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
+from pgsd_nerfstudio.physics import Clock, ParticleHistory, simulate_metric
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import effect, initial_look
-from pgsd_nerfstudio.weather.appearance import InitialLook, ParticleLook
 
 WEATHERS = (("light", 0.5, 7_000), ("moderate", 1.5, 20_000), ("moderate", 1.5, 20_000), ("heavy", 4.0, 30_000))
 """Word, mm/h, and most flakes in the air at once: on a CPU the plugin shows moderate snow with 20,000."""
@@ -52,7 +52,9 @@ class Courtyard:
             snow = effect("snowfall")
             snow = replace(snow, emission=replace(snow.emission, intensity=intensity))
             clock = Clock(fps=25.0, frames=frames)
-            history = simulate(surface, snow, clock, domain_of(self.scene), seed=seed, max_particles=flakes, progress=False)
+            history = simulate_metric(
+                surface, snow, clock, domain_of(self.scene), seed=seed, max_particles=flakes, progress=False
+            )
             self.weathers.append(Weather(amount, history, initial_look(snow, history, seed=seed)))
         self._left = 0
 

@@ -57,7 +57,7 @@ class Denoiser(nn.Module):
     def tokens(self, captions: list[str]) -> Int[Tensor, "b words"]:
         return self.tokenizer(captions, padding="max_length", max_length=WORDS, truncation=True, return_tensors="pt").input_ids
 
-    def forward(self, noisy: Float[Tensor, "b lt c lh lw"], timestep: Int[Tensor, "b"], captions: list[str]) -> Tensor:
+    def forward(self, noisy: Float[Tensor, "b lt c lh lw"], timestep: Int[Tensor, " b"], captions: list[str]) -> Tensor:
         """The predicted v."""
         embedding = self.text_encoder(self.tokens(captions).to(noisy.device)).last_hidden_state
         return self.transformer(noisy, embedding, timestep, return_dict=False)[0]
@@ -66,13 +66,13 @@ class Denoiser(nn.Module):
 @dataclass(frozen=True)
 class Batch:
     noisy: Float[Tensor, "b lt c lh lw"]
-    timestep: Int[Tensor, "b"]
+    timestep: Int[Tensor, " b"]
     captions: list[str]
     target: Float[Tensor, "b lt c lh lw"]
-    weight: Float[Tensor, "b"]
+    weight: Float[Tensor, " b"]
 
 
-def draw_batch(data: Latents, chosen: Sequence[int], alpha_bar: Float[Tensor, "steps"], rng: random.Random) -> Batch:
+def draw_batch(data: Latents, chosen: Sequence[int], alpha_bar: Float[Tensor, " steps"], rng: random.Random) -> Batch:
     """Three clips of each chosen family under the same noise: curated, wrong, and either of the others.
 
     Timesteps are spread evenly over the families of a batch.
@@ -122,7 +122,7 @@ def _words(rng: random.Random, family: Family, kind: int, told: int) -> str:
 def train_denoiser(
     model: Denoiser,
     data: Latents,
-    alpha_bar: Float[Tensor, "steps"],
+    alpha_bar: Float[Tensor, " steps"],
     *,
     minutes: float,
     rate: float,

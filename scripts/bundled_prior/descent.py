@@ -18,14 +18,14 @@ from bundled_prior.courtyard import simulated, with_look
 from bundled_prior.families import FRAMES, HEIGHT, WIDTH
 from bundled_prior.looks import WRONG
 from pgsd_nerfstudio.dynamics.look import LearnedLook
+from pgsd_nerfstudio.effects import effect, initial_look
 from pgsd_nerfstudio.guidance import DistillationConfig, VideoPrior, distill_clip
-from pgsd_nerfstudio.physics import Clock, simulate
+from pgsd_nerfstudio.physics import Clock, simulate_metric
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.scene.demo import demo_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
-from pgsd_nerfstudio.weather import effect, initial_look
 
 CLIPS = 6
 
@@ -61,7 +61,7 @@ def descend(
     vertices, triangles = scene.mesh
     surface = SurfaceMesh(scene.frame.to_metric(vertices), triangles)
     clock = Clock(fps=25.0, frames=125)
-    history = simulate(surface, snow, clock, domain_of(scene), seed=97, max_particles=max_particles, progress=False)
+    history = simulate_metric(surface, snow, clock, domain_of(scene), seed=97, max_particles=max_particles, progress=False)
     curated = initial_look(snow, history, seed=97)
     wrong, learned = with_look(curated, WRONG), LearnedLook()
     prior, rasterizer = VideoPrior.load(folder, "cpu"), choose_rasterizer(scene.gaussians, "cpu")

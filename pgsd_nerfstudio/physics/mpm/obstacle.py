@@ -43,7 +43,7 @@ class Obstacle:
     def __or__(self, other: Obstacle) -> Obstacle:
         return Obstacle(self.parts + other.parts)
 
-    def distance(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def distance(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Signed distance to the nearest part, in metres."""
         return torch.stack([part.sample(points)[0] for part in self.parts]).amin(0)
 
@@ -192,7 +192,7 @@ class Obstacle:
         return _uniform(interpolated, friction, thickness)
 
 
-def _least_in_cell(distance: Float[Tensor, "nodes"], blocks: tuple[int, int, int]) -> Float[Tensor, "nodes"]:
+def _least_in_cell(distance: Float[Tensor, " nodes"], blocks: tuple[int, int, int]) -> Float[Tensor, " nodes"]:
     """The least of a cell's eight nodes, at the lowest of them: where it is positive, no point of the cell lies inside."""
     bx, by, bz = blocks
     dense = distance.reshape(bx, by, bz, EDGE, EDGE, EDGE).permute(0, 3, 1, 4, 2, 5).reshape(bx * EDGE, by * EDGE, bz * EDGE)

@@ -61,7 +61,7 @@ class Particles:
         x: Float[Tensor, "n 3"],
         v: Float[Tensor, "n 3"],
         f: Float[Tensor, "n 3 3"],
-        volume: Float[Tensor, "n"],
+        volume: Float[Tensor, " n"],
         removed: Tensor,  # bool [n]: those that only count
         material: Matter,
     ) -> Tensor:

@@ -62,9 +62,9 @@ class Mpm:
         positions: Float[Tensor, "n 3"],
         velocities: Float[Tensor, "n 3"],
         material: Matter,
-        volume: float | Float[Tensor, "n"],
+        volume: float | Float[Tensor, " n"],
         deformation: Float[Tensor, "n 3 3"] | None = None,
-    ) -> Int[Tensor, "n"]:
+    ) -> Int[Tensor, " n"]:
         """Add particles; returns their ids.
 
         Args:
@@ -181,7 +181,7 @@ class Mpm:
         return self._rows(V, 3)
 
     @property
-    def states(self) -> Int[Tensor, "n"]:
+    def states(self) -> Int[Tensor, " n"]:
         """ACTIVE, RESTING or REMOVED."""
         return self._particles.tags[: len(self), STATE].clone()
 
@@ -191,7 +191,7 @@ class Mpm:
         return self._rows(F, 9).reshape(-1, 3, 3)
 
     @property
-    def volume_ratios(self) -> Float[Tensor, "n"]:
+    def volume_ratios(self) -> Float[Tensor, " n"]:
         """Water: volume relative to that at rest; snow: plastic volume ratio; sand: logarithm of the volume it gained."""
         return self._rows(J, 1)[:, 0]
 

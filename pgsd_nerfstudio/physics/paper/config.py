@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.mpm.materials import lame
-from pgsd_nerfstudio.weather.effect import SurfaceResponse
 
 Range = tuple[float, float]
 Material = Literal["snow", "water", "sand"]

@@ -115,7 +115,7 @@ class PaperSolver:
         return self.state[:, V : V + 3].numpy(force=True).astype(np.float64)
 
     @property
-    def inside(self) -> Bool[ndarray, "n"]:
+    def inside(self) -> Bool[ndarray, " n"]:
         """Which have not left the domain."""
         return self._inside.numpy(force=True) > 0
 
@@ -135,7 +135,7 @@ class PaperSolver:
         self._inside = torch.cat([self._inside, within.int()])
         self._signal = torch.cat([self._signal, new[:, V : V + 3].norm(dim=1) + self.config.sound_speed])
 
-    def keep(self, which: Bool[ndarray, "n"]) -> None:
+    def keep(self, which: Bool[ndarray, " n"]) -> None:
         """Go on with these particles only."""
         chosen = torch.as_tensor(which, device=self.config.device)
         self.state, self._inside, self._signal = self.state[chosen], self._inside[chosen], self._signal[chosen]

@@ -1,0 +1,158 @@
+"""The look a weather starts from: curated numbers of the Effect, varied from particle to particle.
+
+Flakes in the air take their size from the diameter that the physics drew for them: near ones are seen as flakes of several
+pixels, far ones as faint dots. On the surface every flake spreads into a thin soft patch which stands for the water that would
+have gathered there (SurfaceResponse.accumulation_speedup); patches of many sizes and tones overlap into a layer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.special import spence
+from torch import Tensor
+
+from pgsd_nerfstudio.effects.effect import Effect, StateLook
+from pgsd_nerfstudio.effects.matter import Array
+
+
+class Particles(Protocol):
+    """What a look needs to know of the simulated particles (physics.ParticleHistory has it)."""
+
+    @property
+    def ends(self) -> Int[Tensor, " p"]: ...
+    @property
+    def diameters(self) -> Float[Tensor, " p"]: ...
+    @property
+    def represents(self) -> Float[Tensor, " p"]: ...
+    @property
+    def rest_extents(self) -> Float[Tensor, " p"]: ...
+    @property
+    def fps(self) -> float: ...
+
+    def __len__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class ParticleLook:
+    """Appearance of P particles in one state."""
+
+    opacity: Float[Tensor, " p"]
+    scales: Float[Tensor, "p 3"]
+    """Standard deviations in metres; the third axis is the thin one, along the surface normal when landed."""
+    rgb: Float[Tensor, "p 3"]
+
+    def select(self, which: Tensor) -> ParticleLook:
+        return ParticleLook(self.opacity[which], self.scales[which], self.rgb[which])
+
+    def to(self, device: torch.device | str) -> ParticleLook:
+        return ParticleLook(self.opacity.to(device), self.scales.to(device), self.rgb.to(device))
+
+
+@dataclass(frozen=True)
+class InitialLook:
+    """Appearance of every particle, in the air and landed."""
+
+    active: ParticleLook
+    collided: ParticleLook
+    settle_seconds: float
+
+    def select(self, ids: Int[Tensor, " n"]) -> InitialLook:
+        return InitialLook(self.active.select(ids), self.collided.select(ids), self.settle_seconds)
+
+    def to(self, device: torch.device | str) -> InitialLook:
+        return InitialLook(self.active.to(device), self.collided.to(device), self.settle_seconds)
+
+    def collided_at(self, particles: Particles, frame: int, ids: Int[Tensor, " n"]) -> ParticleLook:
+        """Look of landed particles `ids` at `frame`: each spreads from its flake to its patch within `settle_seconds`."""
+        flake, patch = self.active.select(ids), self.collided.select(ids)
+        if self.settle_seconds <= 0:
+            return patch
+        age = (frame - particles.ends[ids] + 1).clamp_min(0) / particles.fps
+        grown = (age / self.settle_seconds).clamp(0, 1).to(patch.opacity)
+        grown = (grown * (2 - grown))[:, None]  # fast at first, as the area of a patch fed at a constant rate
+        # The thin axis is thin from the start: a flake lies down on contact.
+        start = torch.minimum(flake.scales, patch.scales)
+        return ParticleLook(
+            torch.lerp(flake.opacity, patch.opacity, grown[:, 0]),
+            torch.lerp(start, patch.scales, grown),
+            torch.lerp(flake.rgb, patch.rgb, grown),
+        )
+
+
+def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> InitialLook:
+    """The look of every particle before anything is learned; the same for the same seed."""
+    generator = torch.Generator().manual_seed(seed)
+    looks, diameters = effect.appearance, particles.diameters.cpu().float()
+    active = _look(looks.active, _flake_scales(looks.active, diameters), generator)
+    if looks.active.opacity is None:
+        shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one
+        active = ParticleLook(opacity_of_extinction(shadow, active.scales), active.scales, active.rgb)
+    if looks.active.fades_below > 0:
+        thin = (diameters / looks.active.fades_below).clamp_max(1.0) ** 2
+        active = ParticleLook(active.opacity * thin, active.scales, active.rgb)
+    collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
+    # No patch wider than the surface around it: nothing hangs over the edge of a table.
+    widest = (particles.rest_extents.cpu() / REACH).clamp_min(0.004)
+    scales = torch.cat([torch.minimum(collided.scales[:, :2], widest[:, None]), collided.scales[:, 2:]], 1)
+    scales[:, 2] = torch.minimum(scales[:, 2], 0.5 * scales[:, :2].amin(1))
+    collided = ParticleLook(collided.opacity, scales, collided.rgb)
+    return InitialLook(active, collided, looks.collided.settle_seconds).to(particles.diameters.device)
+
+
+FAINTEST = 1.0 / 255.0  # opacity below which a rasterizer draws nothing
+
+
+def opacity_of_extinction(cross_section: Float[Tensor, " p"], scales: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+    """Opacity with which a Gaussian takes as much light out of a view as `cross_section` m^2 of black area spread over it.
+
+    Many such Gaussians then obey Beer-Lambert. The optical depth -ln(1 - a g) of a splat a g, g = exp(-r^2 / 2), integrates to
+    2 pi s^2 (Li2(a) - Li2(1 / 255)), since what is fainter than 1 / 255 is not drawn; s^2 by the geometric mean of the axes.
+    """
+    wanted = cross_section.double() / (2 * math.pi * scales.double().prod(1) ** (2 / 3))
+    opacity = np.linspace(FAINTEST, 0.99, 4096)
+    depth = spence(1 - opacity) - spence(1 - FAINTEST)  # Li2(z) = spence(1 - z)
+    return torch.from_numpy(np.interp(wanted.numpy(), depth, opacity)).float()
+
+
+REACH = 1.7  # standard deviations at which a patch of opacity 0.6 has faded to 0.14: where it seems to end
+
+
+def _flake_scales(state: StateLook, diameters: Float[Tensor, " p"]) -> Float[Tensor, "p 3"]:
+    if state.scale_m is not None:
+        return torch.tensor(state.scale_m).expand(len(diameters), 3)
+    return diameters[:, None] * torch.tensor(state.scale_per_diameter)
+
+
+def _patch_scales(effect: Effect, diameters: Float[Tensor, " p"], represents: Float[Tensor, " p"]) -> Float[Tensor, "p 3"]:
+    """A patch has the volume of the snow it stands for: (2 pi)^(3/2) times the product of its standard deviations."""
+    if effect.appearance.collided.scale_m is not None:
+        return torch.tensor(effect.appearance.collided.scale_m).expand(len(diameters), 3)
+    thickness = effect.surface.layer_thickness
+    flat = (layer_volume(effect, diameters, represents) / (2 * math.pi * thickness)).sqrt()
+    thin = thickness / math.sqrt(2 * math.pi)
+    return torch.stack([flat, flat, torch.full_like(flat, thin)], 1)
+
+
+def layer_volume(effect: Effect, diameters: Array, represents: Array) -> Array:  # [p]
+    """m^3 of cover that landed particles stand for; arrays or tensors."""
+    layer = effect.surface
+    volumes: Any = represents * effect.material.mass(diameters) * (layer.accumulation_speedup / layer.layer_density)
+    return volumes
+
+
+def _look(state: StateLook, base: Float[Tensor, "p 3"], generator: torch.Generator) -> ParticleLook:
+    normal = torch.randn(base.shape[0], 5, generator=generator)
+    # One draw for the size as a whole, a weaker one for the ratio of the flat axes: flakes are not discs.
+    shape = 0.5 * state.scale_spread * normal[:, 1]
+    log = state.scale_spread * normal[:, :1] + torch.stack([shape, -shape, torch.zeros_like(shape)], 1)
+    opacity = ((state.opacity or 0.0) * (1 + state.opacity_spread * normal[:, 2])).clamp(0.05, 0.98)
+    tone = (1 - state.tone_spread * normal[:, 3].abs()).clamp(0.80, 1.0)
+    tint = 1 + 0.012 * normal[:, 4:5] * torch.tensor([-1.0, 0.0, 1.0])  # bluish or warmish by a hair
+    rgb = (torch.tensor(state.rgb) * tone[:, None] * tint).clamp(0.0, 1.0)
+    return ParticleLook(opacity, base * torch.exp(log), rgb)

@@ -1,0 +1,243 @@
+"""What the weather is: the flags that `pgsd preview`, `pgsd simulate` and `ns-train pgsd-weather` share, and their Effect.
+
+The text under each field is its --help; lines end there where a sentence may, since tyro keeps the breaks. Factors are applied
+as those of a request are (application.py); numbers with a unit take the place of what effect or words say. Turbulence follows
+the mean wind: over given ground both are proportional to the friction velocity (Panofsky & Dutton, "Atmospheric Turbulence",
+1984).
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.effects.effect import Effect, Wind
+    from pgsd_nerfstudio.effects.haze import Haze
+    from pgsd_nerfstudio.effects.language_model import Understanding
+    from pgsd_nerfstudio.effects.request import Rgb
+    from pgsd_nerfstudio.effects.surface_response import SurfaceResponse
+    from pgsd_nerfstudio.effects.timeline import Timeline
+
+RANGES: dict[str, tuple[float, float, str]] = {
+    "wind": (0.0, 40.0, " m/s"),  # hurricanes begin at 33
+    "wind_direction": (-360.0, 360.0, " degrees"),
+    "haze": (0.0, 20.0, ""),
+    "accumulation_speedup": (0.001, 100_000.0, ""),
+}
+"""Least and greatest value, and its unit; amount and size have a request's, the rest is judged by the parts of an Effect."""
+
+
+@dataclass(kw_only=True)
+class Knobs:
+    """What the weather is. Not frozen, since nerfstudio's configurations are not and inherit it."""
+
+    effect: str = "snowfall"
+    """Which weather: snowfall, rainfall, fog or sandstorm."""
+    weather: str | None = None
+    """The weather in words, in place of --effect: "purple snow", "glittering yellow sand, no wind", "magic particles".
+    A built-in reader understands many words and says which; with --llm a language model is asked, and may be told anything."""
+    llm: str | None = None
+    """Language model that turns the words into numbers, as PROVIDER:NAME (openai:gpt-4o-mini, anthropic:NAME).
+    Needs pip install 'pgsd-nerfstudio[llm]', and its key in the environment (OPENAI_API_KEY, ANTHROPIC_API_KEY, ...).
+    It is asked once and its answer is kept. If it cannot be asked, the built-in reader answers instead and says so."""
+    llm_url: str | None = None
+    """Address of a server that speaks the protocol of OpenAI or Anthropic, such as http://127.0.0.1:8000/v1 (then vllm:NAME).
+    By default the provider's own, or what OPENAI_BASE_URL, ANTHROPIC_BASE_URL, ... say."""
+    intensity: float | None = None
+    """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20).
+    Fog and sand as visibility in metres (dense fog 60). By default what effect or words say."""
+    amount: float = 1.0
+    """Factor on how much, 0.1-5: 2 doubles snow and rain, and halves the visibility of fog and sand."""
+    size: float = 1.0
+    """Factor on the width of flakes, drops, grains and wisps, 0.2-5. How many there are and how fast they fall stays."""
+    wind: float | None = None
+    """Mean wind in m/s at 2 m above the ground, 0-40; gusts and turbulence follow it. By default what effect or words say."""
+    wind_direction: float | None = None
+    """Where the wind blows to, in degrees counted from the x axis of the scene towards y. By default the effect's own."""
+    color: str | None = None
+    """Colour of what flies and of what has landed, and a third of the haze's: #8040c0, purple, "dusty rose".
+    By default what effect or words say."""
+    haze: float = 1.0
+    """Factor on the opacity of the air between the particles, 0-20; 0 is clear air."""
+    haze_color: str | None = None
+    """Colour of that air, which what is far away takes on: #c0c8d0, lavender. By default what effect or words say."""
+    onset: float | None = None
+    """Seconds within which the weather comes, from a clear start; 0: all of it is there in the first frame.
+    By default the effect's own."""
+    ends: float | None = None
+    """Second after which nothing new comes. By default the effect's own; the built-in ones do not end."""
+    accumulation: tyro.conf.FlagConversionOff[bool] = True
+    """Whether what lands stays, gathers and wets. False: it vanishes, surfaces stay bare and dry."""
+    accumulation_speedup: float | None = None
+    """Time lapse of the cover: what lands counts as so many times as much. By default the effect's own (snow 800, sand 60)."""
+    ambience: tyro.conf.FlagConversionOff[bool] = True
+    """Whether light and sky follow the weather. False: they stay as captured."""
+    exposure: float | None = None
+    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02).
+    By default the effect's own, which for snow is 0, no motion blur."""
+
+    def effect_asked(self, cache_dir: Path | None = None) -> tuple[Effect, list[str]]:
+        """The effect with all knobs turned, and what is to be said about it: how the words were read, what cannot be done.
+
+        Args:
+            cache_dir: folder of what language models answered; the common cache if none is given.
+
+        Raises:
+            ValueError: a knob cannot be used, or the words name nothing that could be in the air; one sentence says why.
+            OSError: the answer of a language model cannot be written.
+        """
+        return self.turned(self.asked(cache_dir))
+
+    def asked(self, cache_dir: Path | None = None) -> Understanding | None:
+        """What the words for the weather ask for, None without words; raises as `effect_asked`."""
+        self.judge()
+        return None if self.weather is None else _asked(self.weather, self.llm, self.llm_url, cache_dir)
+
+    def turned(self, asked: Understanding | None) -> tuple[Effect, list[str]]:
+        """The effect asked for, with all other knobs turned, and what is to be said about it; raises as `effect_asked`."""
+        self.judge()
+        effect, said = self._base(asked)
+        # Words and knobs are applied one after the other: their factors multiply.
+        effect, lacks = self._factors(effect)
+        said += [*lacks, *self._lacks(effect)]
+        effect = replace(
+            effect,
+            wind=self._wind(effect),
+            timeline=self._timeline(effect.timeline),
+            surface=self._surface(effect.surface),
+            haze=self._haze(effect.haze),
+            ambience=effect.ambience if self.ambience else None,
+        )
+        return effect, said
+
+    def judge(self) -> None:
+        """Refuse what can be refused without asking anyone.
+
+        Raises:
+            ValueError: two knobs do not go together, or a number is out of its range.
+        """
+        from pgsd_nerfstudio.effects.language_model import check_model
+        from pgsd_nerfstudio.effects.request import LIMITS
+
+        if self.weather is not None and self.effect != Knobs.effect:
+            raise ValueError(
+                f"--weather stands in place of --effect, got both {self.weather!r} and {self.effect}: leave out one"
+            )
+        if self.llm is not None and self.weather is None:
+            raise ValueError(f"--llm {self.llm} needs words to ask about: add --weather, such as --weather 'purple snow'")
+        if self.llm_url is not None and self.llm is None:
+            raise ValueError(f"--llm-url {self.llm_url} needs the name of a model there: add --llm PROVIDER:NAME")
+        if self.llm is not None:
+            check_model(self.llm, self.llm_url)
+        for name, (low, high, unit) in {**RANGES, **{name: (*LIMITS[name], "") for name in ("amount", "size")}}.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"--{name.replace('_', '-')} must lie in {low:g}-{high:g}{unit}, got {value:g}")
+
+    def _base(self, asked: Understanding | None) -> tuple[Effect, list[str]]:
+        """The effect of that name or of those words, at the intensity and exposure that are given."""
+        from pgsd_nerfstudio.effects.application import applied, remarks
+        from pgsd_nerfstudio.effects.effect import effect as named
+
+        if asked is None:
+            return named(self.effect, intensity=self.intensity, exposure=self.exposure), []
+        request, said = asked.request, [asked.remark]
+        if self.intensity is not None and request.amount != 1:
+            said.append(f"--intensity {self.intensity:g} takes the place of amount {request.amount:g}")
+            request = replace(request, amount=1.0)
+        effect = applied(request)
+        said += remarks(request)
+        if self.intensity is not None:
+            effect = replace(effect, emission=replace(effect.emission, intensity=self.intensity))
+        if self.exposure is not None:
+            effect = replace(effect, appearance=replace(effect.appearance, exposure=self.exposure))
+        return effect, said
+
+    def _factors(self, effect: Effect) -> tuple[Effect, tuple[str, ...]]:
+        """The knobs that a request has too; only what the video model is told stays."""
+        from pgsd_nerfstudio.effects.application import applied, remarks
+        from pgsd_nerfstudio.effects.request import Request
+
+        rgb = None if self.color is None else colour_of("color", self.color)
+        accumulates = None if self.accumulation else False
+        request = Request(
+            base=None,
+            rgb=rgb,
+            amount=float(self.amount),
+            size=float(self.size),
+            accumulates=accumulates,
+            prompt="{scene}",
+        )
+        return replace(applied(request, base=effect), prompt=effect.prompt), remarks(request, base=effect)
+
+    def _wind(self, effect: Effect) -> Wind:
+        from pgsd_nerfstudio.effects.effect import EFFECTS
+
+        wind = effect.wind
+        if self.wind is not None:
+            # Of the effect without words, which may have asked for still air: nothing in proportion to that can be found.
+            own = EFFECTS[effect.name].wind
+            factor = self.wind / own.speed if own.speed > 0 else 1.0
+            wind = replace(wind, speed=self.wind, turbulence=factor * own.turbulence, diffusivity=factor * own.diffusivity)
+        if self.wind_direction is not None:
+            wind = replace(wind, direction_degrees=self.wind_direction)
+        return wind
+
+    def _timeline(self, timeline: Timeline) -> Timeline:
+        given = {"onset": self.onset, "ends": self.ends}
+        return replace(timeline, **{name: value for name, value in given.items() if value is not None})
+
+    def _surface(self, surface: SurfaceResponse) -> SurfaceResponse:
+        if self.accumulation_speedup is not None:
+            surface = replace(surface, accumulation_speedup=self.accumulation_speedup)
+        if not self.accumulation and surface.landing == "wets":
+            surface = replace(surface, landing="vanishes")  # drops still splash
+        return surface
+
+    def _haze(self, haze: Haze | None) -> Haze | None:
+        rgb = None if self.haze_color is None else colour_of("haze-color", self.haze_color)
+        return None if haze is None else replace(haze, amount=haze.amount * self.haze, rgb=rgb or haze.rgb)
+
+    def _lacks(self, effect: Effect) -> Iterator[str]:
+        """What the effect has no use for."""
+        if effect.haze is None and (self.haze not in (0, 1) or self.haze_color is not None):
+            yield f"--haze and --haze-color change nothing: the air between the particles of {effect.name} is clear"
+        if self.accumulation_speedup is not None and not (effect.surface.landing == "stays" and effect.surface.accumulates):
+            yield f"--accumulation-speedup {self.accumulation_speedup:g} changes nothing: {effect.name} leaves no layer here"
+
+
+@lru_cache(maxsize=64)
+def _asked(weather: str, llm: str | None, llm_url: str | None, cache_dir: Path | None) -> Understanding:
+    """Asks no more than once in a process, also where nobody can be reached."""
+    from pgsd_nerfstudio.effects.language_model import request_for
+
+    return request_for(weather, model=llm, base_url=llm_url, cache_dir=cache_dir, reader_fallback=True)
+
+
+def colour_of(flag: str, text: str) -> Rgb:
+    """The colour, sRGB in 0-1, that is written as #rgb, #rrggbb or by its name in CSS or the XKCD survey.
+
+    Raises:
+        ValueError: it is no such colour; `flag` is where it was given.
+    """
+    from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
+
+    from pgsd_nerfstudio.effects.vocabulary import colour
+
+    name = " ".join(text.lower().split())
+    found = to_rgb(name) if re.fullmatch(r"#([0-9a-f]{3}|[0-9a-f]{6})", name) else colour(name)
+    if found is None:
+        # The well-known names first: "purpel" is nearer to "purply", but was hardly meant so.
+        known = ([*CSS4_COLORS], [each.removeprefix("xkcd:") for each in XKCD_COLORS])
+        close = [each for names in known for each in difflib.get_close_matches(name, names, cutoff=0.75) if colour(each)]
+        guess = f"; was {close[0]!r} meant?" if close else ""
+        raise ValueError(f"--{flag} must be a colour such as #8040c0 or purple, got {text!r}{guess}")
+    return found

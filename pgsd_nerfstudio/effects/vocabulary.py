@@ -1,0 +1,219 @@
+"""Words for weather and what they stand for: kinds of things in the air, qualities, colours.
+
+Colours are the names of CSS and, for the rest, of the XKCD survey (matplotlib has both); how far "dark" or "pale" changes a
+colour was fitted to the pairs in that survey ("pale blue" against "blue"). The other numbers are estimates: relative to the
+effect's own, and for what is no weather by how it falls (a petal at about 0.8 m/s, ash at half a metre, pollen hardly at all).
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
+
+from pgsd_nerfstudio.effects.request import Base, Rgb
+
+
+def _spread(*rows: tuple[str, Any]) -> dict[str, Any]:
+    return {word.strip(): meaning for words, meaning in rows for word in words.split(",")}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Something that can be in the air."""
+
+    base: Base
+    rgb: Rgb | None = None
+    landed_rgb: Rgb | None = None
+    factors: dict[str, float | bool] = field(default_factory=dict)
+    rank: int = 2
+    """Of several kinds in one text the highest is meant: 3 petals, ash; 2 snow, rain; 1 snowy, shower, particles; 0 storm."""
+
+
+def _particle(rgb: Rgb | None = None, landed_rgb: Rgb | None = None, **factors: float | bool) -> Kind:
+    return Kind("snowfall", rgb, landed_rgb, factors, rank=3)
+
+
+ASH, SOOT, SMOKE = (0.42, 0.41, 0.4), (0.3, 0.29, 0.28), (0.45, 0.44, 0.43)
+KINDS: dict[str, Kind] = _spread(
+    ("snow, snowing, snows, snowfall, snowflake, flake", Kind("snowfall")),
+    ("rain, raining, rains, rainfall, raindrop", Kind("rainfall")),
+    ("sleet", Kind("rainfall", (0.85, 0.88, 0.92), factors={"opacity": 1.3, "fall_speed": 0.6})),
+    (
+        "hail, hailstone, hailstorm",
+        Kind("rainfall", (0.92, 0.94, 0.97), None, {"size": 3.0, "fall_speed": 1.5, "opacity": 2.0, "accumulates": True}),
+    ),
+    ("fog, mist", Kind("fog")),
+    ("haze", Kind("fog", factors={"amount": 0.3})),
+    ("smoke", Kind("fog", SMOKE, factors={"tumbling": 1.5})),
+    ("smog", Kind("fog", (0.66, 0.61, 0.52))),
+    ("steam, vapour, vapor", Kind("fog", (0.96, 0.96, 0.97), factors={"amount": 0.7})),
+    ("sand, sandstorm, dust storm, duststorm, haboob", Kind("sandstorm")),
+    ("dust", Kind("sandstorm", factors={"size": 0.5, "amount": 0.5, "wind": 0.4})),
+    ("ash, ashes, ashfall, soot, cinder", _particle(ASH, size=0.8, fall_speed=0.5)),
+    ("ember, spark", _particle((1.0, 0.5, 0.12), SOOT, size=0.4, amount=0.5, fall_speed=0.3, glitter=0.9)),
+    (
+        "petal, blossom, cherry blossom, cherry petal, rose petal",
+        _particle((0.98, 0.74, 0.82), size=2.0, amount=0.4, fall_speed=0.8, tumbling=3.0),
+    ),
+    (
+        "leaf, leaves, foliage, autumn leaf, autumn leaves, fall leaves",
+        _particle((0.72, 0.4, 0.12), size=4.0, amount=0.2, fall_speed=1.3, tumbling=3.0),
+    ),
+    ("confetti", _particle(size=1.5, amount=0.6, opacity=1.2, tumbling=3.5)),
+    ("feather", _particle(size=4.0, amount=0.15, fall_speed=0.5, tumbling=2.5)),
+    ("pollen", _particle((0.93, 0.8, 0.25), size=0.25, amount=0.6, fall_speed=0.2)),
+    ("dandelion seed, dandelion, fluff", _particle(size=1.5, amount=0.2, fall_speed=0.4)),
+    ("dust mote, mote", _particle((0.9, 0.86, 0.76), size=0.2, amount=0.4, fall_speed=0.2, wind=0.3)),
+    (
+        "magic particle, magical particle, magic dust, fairy dust, pixie dust, stardust, star dust, firefly",
+        _particle((0.8, 0.65, 1.0), fall_speed=0.4, tumbling=2.0, glitter=0.8, accumulates=False),
+    ),
+    ("snowy, wintry, blizzard, snowstorm, whiteout, flurry", Kind("snowfall", rank=1)),
+    ("rainy, drop, droplet, shower, drizzle, drizzling, downpour, cloudburst, monsoon, pouring", Kind("rainfall", rank=1)),
+    ("thunderstorm, rainstorm, hurricane, typhoon", Kind("rainfall", rank=1)),
+    ("foggy, misty, hazy, cloudy, cloud", Kind("fog", rank=1)),
+    ("smoky", Kind("fog", SMOKE, rank=1)),
+    ("sandy, dusty, grain", Kind("sandstorm", rank=1)),
+    ("ashy", Kind("snowfall", ASH, None, {"size": 0.8, "fall_speed": 0.5}, 1)),
+    ("particle, speck, glitter, sparkle, star", Kind("snowfall", factors={"fall_speed": 0.6}, rank=1)),
+    ("storm, tempest, squall", Kind("rainfall", rank=0)),
+)
+"""In the singular. Some of rank 1 and 0 are qualities too: a blizzard of petals, a sand storm."""
+NOMINAL: dict[Base, Rgb] = {
+    "snowfall": (0.95, 0.97, 1.0),
+    "rainfall": (0.75, 0.8, 0.86),
+    "fog": (0.86, 0.88, 0.9),
+    "sandstorm": (0.8, 0.63, 0.4),
+}
+"""What "dark" or "pale" changes where the text names no colour."""
+
+QUALITIES: dict[str, dict[str, float | bool]] = _spread(
+    ("tiny, minuscule, microscopic, minute", {"size": 0.35}),
+    ("small, little, fine, powdery, powder", {"size": 0.6}),
+    ("big, large, coarse, chunky, fat, plump", {"size": 1.8}),
+    ("huge, giant, gigantic, enormous, massive", {"size": 3.5}),
+    ("fluffy", {"size": 1.5, "fall_speed": 0.8, "tumbling": 1.3}),
+    ("sparse, few, scattered, occasional, a few, thin", {"amount": 0.3}),
+    ("light, a little, dusting", {"amount": 0.4}),
+    ("faint", {"amount": 0.5, "opacity": 0.6}),
+    ("moderate", {"amount": 1.0}),
+    ("heavy, much, lots of, lot of, many, plenty of, deep", {"amount": 2.0}),
+    ("dense, thick, abundant, intense", {"amount": 2.5}),
+    ("torrential, extreme", {"amount": 4.0}),
+    ("flurry", {"amount": 0.4}),
+    ("drizzle, drizzling", {"amount": 0.2, "size": 0.4, "fall_speed": 0.5}),
+    ("downpour, cloudburst, monsoon, pouring", {"amount": 4.0}),
+    ("storm, tempest, squall", {"amount": 2.0, "wind": 2.5}),
+    ("thunderstorm, rainstorm", {"amount": 3.0, "wind": 2.5}),
+    ("blizzard, snowstorm, whiteout, hurricane, typhoon", {"amount": 4.0, "wind": 3.0}),
+    ("strong, violent, fierce", {"amount": 1.8, "wind": 1.8}),
+    ("raging, howling", {"amount": 2.0, "wind": 3.0}),
+    ("windy, stormy, blowing, blustery, breezy", {"wind": 2.0}),
+    ("gusty", {"wind": 2.2, "tumbling": 1.3}),
+    ("calm, still, quiet, peaceful", {"wind": 0.3, "tumbling": 0.7}),
+    ("windless", {"wind": 0.0}),
+    ("gentle, soft, tender", {"fall_speed": 0.7, "wind": 0.5}),
+    ("slow, lazy, dreamy", {"fall_speed": 0.5, "wind": 0.7}),
+    ("fast, quick, rapid, swift, speeding", {"fall_speed": 1.8}),
+    ("drifting", {"fall_speed": 0.6}),
+    ("floating, hovering, weightless, suspended", {"fall_speed": 0.25}),
+    ("driving, driven, horizontal, sideways", {"wind": 3.0}),
+    ("swirling, whirling, eddying", {"wind": 1.5, "tumbling": 2.0}),
+    ("tumbling, fluttering, spinning, twirling, dancing, swaying, wobbling", {"tumbling": 2.5}),
+    ("glittering, glittery, glitter, sparkling, sparkly, sparkle, twinkling, glinting", {"glitter": 0.7}),
+    ("shimmering, shiny, iridescent, glossy", {"glitter": 0.4}),
+    ("glowing, luminous, radiant, shining", {"glitter": 0.6, "opacity": 1.3}),
+    ("magic, magical, fairy, enchanted", {"glitter": 0.8, "fall_speed": 0.6}),
+    ("transparent, translucent, glassy, ghostly, sheer, clear", {"opacity": 0.4}),
+    ("opaque, solid", {"opacity": 1.6}),
+    ("wet, sticky, slushy", {"size": 1.3, "fall_speed": 1.3, "accumulates": True}),
+    ("accumulating, accumulate, accumulation, settling, settle, sticking, stick", {"accumulates": True}),
+    ("gathering, gather, covering, cover, landing, land, piling, piling up, pile up, blanketing", {"accumulates": True}),
+    ("melting, melt, vanishing, vanish, disappearing, disappear, evaporating, dissolving", {"accumulates": False}),
+)
+WINDS: dict[str, float] = _spread(("wind", 1.3), ("gust", 2.0), ("breeze", 0.8), ("draught, draft", 0.6), ("gale", 3.0))
+"""Nouns that what stands before them describes: a strong wind is more wind, not more snow."""
+
+# Towards what, and how far on the way there.
+TINTS: dict[str, tuple[str, float]] = _spread(
+    ("light", ("white", 0.3)),
+    ("pale, whitish", ("white", 0.45)),
+    ("soft, pastel, faded", ("white", 0.4)),
+    ("dark, dirty", ("black", 0.3)),
+    ("deep", ("black", 0.35)),
+    ("bright", ("vivid", 0.45)),
+    ("vivid, neon, electric, intense, saturated", ("vivid", 0.9)),
+    ("dull, muted, drab, dusty", ("grey", 0.5)),
+)
+DEGREES: dict[str, float] = _spread(
+    ("very, really, extremely, super, incredibly, ultra, so, extra", 1.6),
+    ("slightly, somewhat, fairly, rather, a bit", 0.5),
+)
+SHADES = {"snow white": "white", "jet black": "black", "pitch black": "black", "silvery": "silver", "golden": "gold"}
+# Names of the survey that in a sentence are more often a place than a colour, or not fit to print.
+SCENERY = _spread(
+    ("sky, sea, ocean, grass, forest, fern, moss, desert, earth, stone, mud, clay, dirt, swamp, brick, cement, steel", None),
+    ("leather, denim, seaweed, lichen, marine, royal, barney, adobe, spruce, pine, bruise, poo, poop, shit, puke", None),
+    ("vomit, snot, booger, bile, diarrhea", None),
+)
+
+
+def colour(name: str) -> Rgb | None:
+    """The colour of that name, as CSS has it, else as most people in the survey do."""
+    last = name.rpartition(" ")[2]
+    name = SHADES.get(name, name)
+    joined = name.replace(" ", "")
+    # Where what follows is a thing in the air, the words before describe it: "white smoke", "dark sand".
+    if (last in KINDS and last != name) or name in KINDS or name.startswith(("heavy ", "strong ")):
+        return None
+    if joined in CSS4_COLORS:
+        return to_rgb(CSS4_COLORS[joined])
+    if name in SCENERY or name in TINTS or f"xkcd:{name}" not in XKCD_COLORS:
+        return None
+    return to_rgb(XKCD_COLORS[f"xkcd:{name}"])
+
+
+def tinted(rgb: Rgb, tint: str, degree: float = 1.0) -> Rgb:
+    """The colour that is called "dark", "pale" ... of `rgb`; a degree above 1 is "very", below 1 "slightly"."""
+    target, share = TINTS[tint]
+    share = 1 - (1 - share) ** degree
+    if target == "vivid":
+        hue, saturation, _ = colorsys.rgb_to_hsv(*rgb)
+        # Grey has no hue that could glow: it only gets lighter.
+        towards = colorsys.hsv_to_rgb(hue, 1.0 if saturation > 0.05 else saturation, 1.0)
+    else:
+        luma = 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
+        towards = ({"white": 1.0, "black": 0.0, "grey": luma}[target],) * 3
+    red, green, blue = (c + share * (t - c) for c, t in zip(rgb, towards, strict=True))
+    return red, green, blue
+
+
+def mixed(colours: Sequence[Rgb]) -> Rgb:
+    """What particles of these colours look like together from afar: the mean of their light (IEC 61966-2-1 for sRGB)."""
+    if len(colours) == 1:
+        return colours[0]
+    red, green, blue = (_encoded(sum(map(_light, parts)) / len(parts)) for parts in zip(*colours, strict=True))
+    return red, green, blue
+
+
+def _light(c: float) -> float:
+    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+
+
+def _encoded(light: float) -> float:
+    return 12.92 * light if light <= 0.0031308 else min(1.055 * light ** (1 / 2.4) - 0.055, 1.0)
+
+
+ENDINGS = {"ies": ("y",), "es": ("",), "s": ("",), "ily": ("y",), "ly": ("", "le"), "ish": ("", "e")}
+
+
+def forms(word: str) -> Iterator[str]:
+    """The word, and what it may be a plural, an adverb or a shade of."""
+    yield word
+    for ending, others in ENDINGS.items():
+        if word.endswith(ending) and len(word) > len(ending) + 2:
+            yield from (word.removesuffix(ending) + other for other in others)

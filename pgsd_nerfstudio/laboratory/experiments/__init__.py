@@ -1,0 +1,1 @@
+"""Experiments with a known end, which judge the material point method."""

@@ -1,0 +1,1 @@
+"""One module for each room that offers figures, and what they share."""

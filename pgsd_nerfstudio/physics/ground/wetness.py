@@ -1,0 +1,210 @@
+"""Water on surfaces: what lands is put into a grid around them, spreads, and dries.
+
+Only cells near the surface exist (the paper: "a coarse 3D grid surrounding the mesh"), as one list of cells and a sparse matrix
+of who touches whom, so memory follows the area of the surface and not the volume of the air: about 110 bytes a cell. Between
+cells water diffuses by the heat equation on that graph, dw/dt = (D / h^2) sum over neighbours (w_j - w_i), which no wall of
+missing cells lets through. Its step of any length is the exact exponential: inside the band the water of a point becomes the
+discrete Gaussian (Lindeberg 1990) whose variance is 2 D t along each axis. Drying takes the same share from all cells.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.sparse import csr_array
+
+from pgsd_nerfstudio.physics.clock import Domain
+from pgsd_nerfstudio.physics.ground.landing import sample_triangles
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+
+MAX_CELLS = 20_000_000  # 2.2 GB
+_TAIL = 1e-13  # of the water of a cell that a step may place one cell too near
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wetting:
+    """How surfaces become wet and dry."""
+
+    cell: float = 0.05
+    """Edge of a cell in metres; finer wet patches are not resolved."""
+    reach: int = 2
+    """Cells on each side of the surface that can hold water: one for the interpolation, one to spread around edges."""
+    diffusivity: float = 2e-5
+    """m^2/s; a spot of water grows to a standard deviation of 5 cm within a minute."""
+    drying_seconds: float = 120.0
+    """Time in which a surface loses 63 % of its water; inf never dries."""
+
+    def __post_init__(self) -> None:
+        if not (self.cell > 0 and self.reach >= 1 and self.diffusivity >= 0 and self.drying_seconds > 0):
+            given = f"{self.cell:g} m, {self.reach}, {self.diffusivity:g} m^2/s and {self.drying_seconds:g} s"
+            raise ValueError(f"wetting needs cell > 0, reach >= 1, diffusivity >= 0 and drying_seconds > 0, got {given}")
+
+
+class WetnessGrid:
+    """Water near a surface; `deposit`, `step` and `sample` it. Cells are known by their lattice points, their centres."""
+
+    def __init__(
+        self, points: Float[ndarray, "p 3"], lower: Float[ndarray, "3"], shape: tuple[int, int, int], wetting: Wetting
+    ):
+        """A grid of the cells within `reach` of points that cover the surface, of a lattice that starts at `lower`.
+
+        Raises:
+            ValueError: there would be more than 20 million cells.
+        """
+        self.wetting = wetting
+        self.lower = np.asarray(lower, np.float64)
+        self.shape = shape
+        self.keys: Int[ndarray, " c"] = self._near(points)
+        self.water: Float[ndarray, " c"] = np.zeros(len(self.keys))  # kg
+        self.deposited = 0.0  # kg so far
+        self.evaporated = 0.0  # kg so far
+
+    @staticmethod
+    def of(surface: SurfaceMesh, domain: Domain, wetting: Wetting | None = None) -> WetnessGrid:
+        """Around a surface, within a box of air."""
+        wetting = wetting or Wetting()
+        corners = np.zeros((0, 3, 3))
+        if len(surface.triangles):
+            corners = surface.vertices.numpy(force=True)[surface.triangles.numpy(force=True)].astype(np.float64)
+        x, y, z = (math.ceil(edge / wetting.cell) + 1 for edge in domain.size)
+        return WetnessGrid(sample_triangles(corners, wetting.cell / 2), np.asarray(domain.lower), (x, y, z), wetting)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def held(self) -> float:
+        """Water in the grid, kg; deposited = held + evaporated."""
+        return float(self.water.sum())
+
+    @property
+    def centres(self) -> Float[ndarray, "c 3"]:
+        """Lattice points of the cells, metres."""
+        return self.lower + self.wetting.cell * np.stack(np.unravel_index(self.keys, self.shape), 1)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the grid."""
+        matrix = self._mixing
+        return sum(part.nbytes for part in (self.keys, self.water, matrix.data, matrix.indices, matrix.indptr))
+
+    def deposit(self, points: Float[ndarray, "n 3"], mass: Float[ndarray, " n"]) -> float:
+        """Add `mass` kg of water at each point, shared among the lattice points around it as trilinear weights say.
+
+        What falls on lattice points that do not exist goes to those that do; returns the kg of points that had none at all,
+        which are not deposited.
+        """
+        cells, weights = self._around(points)
+        total = weights.sum(1)
+        caught = total > 0
+        share = weights[caught] / total[caught, None] * np.asarray(mass, np.float64)[caught, None]
+        np.add.at(self.water, cells[caught], share)
+        self.deposited += float(share.sum())
+        return float(np.asarray(mass, np.float64)[~caught].sum())
+
+    def step(self, seconds: float) -> None:
+        """Spread and dry for as long as `seconds`; exact, so that steps may have any length."""
+        self._spread(seconds)
+        before = self.held
+        self.water *= math.exp(-seconds / self.wetting.drying_seconds)
+        self.evaporated += before - self.held
+
+    def sample(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
+        """kg of water per m^3 at points, interpolated between the lattice points that exist; 0 where there are none."""
+        cells, weights = self._around(points)
+        found = (weights * self.water[cells]).sum(1) if len(self) else np.zeros(len(points))
+        return found / weights.sum(1).clip(1e-12) / self.wetting.cell**3
+
+    def _spread(self, seconds: float) -> None:
+        """exp(t L) by uniformisation (Jensen 1953): a Poisson-weighted mean of powers of a matrix that only mixes.
+
+        All terms are positive and their weights sum to one, so that water neither becomes negative nor is lost.
+        """
+        rate = 6 * self.wetting.diffusivity / self.wetting.cell**2 * seconds  # mean number of mixings
+        if rate == 0 or len(self) == 0:
+            return
+        pieces = math.ceil(rate / 50.0)  # exp(-rate) must not underflow
+        rate /= pieces
+        for _ in range(pieces):
+            weight, left = math.exp(-rate), 1.0
+            term, total = self.water, np.zeros_like(self.water)
+            order = 0
+            while True:
+                last = order > rate and left - weight < _TAIL
+                total += (left if last else weight) * term
+                if last:
+                    break
+                left -= weight
+                order += 1
+                weight *= rate / order
+                term = self._mixing @ term
+            self.water = total
+
+    @cached_property
+    def _mixing(self) -> csr_array:
+        """1 + L / 6: every cell gives a sixth of its water to each neighbour and keeps what has nowhere to go."""
+        at = np.stack(np.unravel_index(self.keys, self.shape), 1)
+        rows, columns = [], []
+        for axis in range(3):
+            inside = (at[:, axis] + 1 < self.shape[axis]).nonzero()[0]
+            stride = int(np.prod(self.shape[axis + 1 :]))
+            other, exists = self._find(self.keys[inside] + stride)
+            rows += [inside[exists], other[exists]]
+            columns += [other[exists], inside[exists]]
+        row, column = np.concatenate(rows).astype(np.int32), np.concatenate(columns).astype(np.int32)
+        count = len(self)
+        keep = 1.0 - np.bincount(row, minlength=count) / 6.0
+        own = np.arange(count, dtype=np.int32)
+        data = np.concatenate([np.full(len(row), 1 / 6), keep])
+        return csr_array((data, (np.concatenate([row, own]), np.concatenate([column, own]))), shape=(count, count))
+
+    def _around(self, points: Float[ndarray, "n 3"]) -> tuple[Int[ndarray, "n 8"], Float[ndarray, "n 8"]]:
+        """The eight lattice points around each point and their weights, 0 where there is none."""
+        at = (np.asarray(points, np.float64) - self.lower) / self.wetting.cell
+        at = np.where(np.isfinite(at), at, -2.0)
+        corner = np.floor(at)
+        share = at - corner
+        cells, weights = [], []
+        for offset in np.ndindex(2, 2, 2):
+            lattice = corner + offset
+            inside = np.all((lattice >= 0) & (lattice < self.shape), axis=1)
+            at_edge = tuple(np.where(inside[:, None], lattice, 0).astype(np.int64).T)
+            key = np.asarray(np.ravel_multi_index(at_edge, self.shape))
+            cell, exists = self._find(key)
+            cells.append(cell)
+            weights.append(np.where(exists & inside, np.where(offset, share, 1 - share).prod(1), 0.0))
+        return np.stack(cells, 1), np.stack(weights, 1)
+
+    def _find(self, keys: Int[ndarray, " n"]) -> tuple[Int[ndarray, " n"], ndarray]:
+        """Index of each key, and whether it is there."""
+        if len(self) == 0:
+            return np.zeros(len(keys), np.int64), np.zeros(len(keys), bool)
+        found = np.searchsorted(self.keys, keys).clip(max=len(self) - 1)
+        return found, self.keys[found] == keys
+
+    def _near(self, points: Float[ndarray, "p 3"]) -> Int[ndarray, " c"]:
+        """Sorted keys of the lattice points within `reach` cells of the points along every axis."""
+        # Within `reach` beyond the lattice, so that cells at its border know of what lies just outside. One number a cell:
+        # sorting rows takes far longer.
+        reach, wide = self.wetting.reach, tuple(side + 2 * self.wetting.reach for side in self.shape)
+        at = np.rint((points - self.lower) / self.wetting.cell).astype(np.int64) + reach
+        at = at[((at >= 0) & (at < wide)).all(1)]
+        keys = np.unique(np.ravel_multi_index(tuple(at.T), wide))
+        steps = np.arange(-reach, reach + 1)
+        for axis in range(3):  # a cube grows axis by axis
+            place = np.stack(np.unravel_index(keys, wide), 1)
+            moved = np.repeat(place, len(steps), 0)
+            moved[:, axis] += np.tile(steps, len(place))
+            moved = moved[(moved[:, axis] >= 0) & (moved[:, axis] < wide[axis])]
+            keys = np.unique(np.ravel_multi_index(tuple(moved.T), wide))
+        at = np.stack(np.unravel_index(keys, wide), 1) - reach
+        at = at[((at >= 0) & (at < self.shape)).all(1)]
+        if len(at) > MAX_CELLS:
+            edge = self.wetting.cell
+            raise ValueError(f"wetness needs at most {MAX_CELLS:,} cells, {edge:g} m make {len(at):,}; take larger cells")
+        return np.sort(np.ravel_multi_index(tuple(at.T), self.shape))

@@ -1,0 +1,72 @@
+"""Laws of what an effect emits: how fast each size falls, how many of each size a cubic metre of air holds."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.integrate import cumulative_trapezoid
+
+from pgsd_nerfstudio.effects import snowfall
+from pgsd_nerfstudio.effects.matter import Emission, Material
+from pgsd_nerfstudio.physics.laws import fall_speeds, size_distributions
+
+MM_PER_HOUR = 1.0 / 3600.0  # of water, in kg/(m^2 s)
+
+_LAWS = {
+    "rain": fall_speeds.rain_fall_speed,
+    "fog": fall_speeds.fog_fall_speed,
+    "sand": fall_speeds.sand_fall_speed,
+}
+
+
+def fall_speed(diameter: Float[ndarray, " n"], material: Material) -> Float[ndarray, " n"]:
+    """Terminal speed in m/s of particles with `diameter` in metres.
+
+    Raises:
+        ValueError: a diameter is outside the range for which the law was made.
+    """
+    if material.speed_law == "power":
+        return material.speed_factor * snowfall.fall_speed(diameter, material)
+    return material.speed_factor * _LAWS[material.speed_law](diameter)
+
+
+def number_density(diameter: Float[ndarray, " d"], emission: Emission, material: Material) -> Float[ndarray, " d"]:
+    """Particles per m^3 of air and metre of diameter, at ascending diameters.
+
+    All of the water that is asked for, or `share` of the extinction, is carried by this range of sizes.
+    """
+    if emission.kind == "snowflakes":
+        melted = snowfall.melted_diameter(material.mass(diameter))
+        # From per metre of melted diameter to per metre of diameter.
+        shape = snowfall.number_density(melted, emission.intensity) * np.gradient(melted, diameter)
+    elif emission.kind == "raindrops":
+        shape = size_distributions.marshall_palmer(emission.intensity).density(diameter)
+    elif emission.kind == "fog droplets":
+        shape = size_distributions.advection_fog().density(diameter)
+    else:
+        shape = size_distributions.blown_sand(1e-3).density(diameter)
+    if emission.precipitates:
+        carried = integral(shape * fall_speed(diameter, material) * material.mass(diameter), diameter)
+        return shape * emission.intensity * MM_PER_HOUR / carried
+    return shape * emission.share * extinction(emission) / integral(shape * cross_section(diameter), diameter)
+
+
+def extinction(emission: Emission) -> float:
+    """Extinction per metre of fog and sand from their visibility (Koschmieder 1924); 0 for rain and snow."""
+    return 0.0 if emission.precipitates else float(np.log(50.0)) / emission.intensity
+
+
+def cross_section(diameter: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
+    """Extinction cross-section in m^2 of particles much larger than the wavelength: twice their shadow."""
+    return 0.5 * np.pi * diameter**2
+
+
+def integral(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> float:
+    """Trapezoidal integral."""
+    return float(cumulative(density, at)[-1])
+
+
+def cumulative(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
+    """Trapezoidal integral up to each abscissa."""
+    return cumulative_trapezoid(density, at, initial=0.0)

@@ -1,0 +1,234 @@
+"""How many particles of which size are in a cubic metre of air: rain, fog, sand and dust.
+
+Rain: Marshall & Palmer, "The distribution of raindrops with size" (1948). Fog: log-normal with the extinction, effective radius
+and variance of the models of Shettle & Fenn (1979, AFGL-TR-79-0214), which are gamma distributions of the radius in µm:
+r^3 exp(-0.3 r) of 20 per cm^3 and r^6 exp(-3 r) of 200 per cm^3. Sand: the sand populations of desert soils of Tegen et al.
+(2002), as ECHAM-HAM holds them. Dust: the background modes of d'Almeida (1987), as the Community Land Model holds them.
+Everything is in metres; a distribution is N(D) in 1/m^4: particles per m^3 of air and metre of diameter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.integrate import trapezoid
+from scipy.special import gammainc, ndtr, ndtri
+
+from pgsd_nerfstudio.physics.laws.fall_speeds import QUARTZ_DENSITY, WATER_DENSITY, rain_fall_speed
+
+Speed = Callable[[Float[ndarray, " n"]], Float[ndarray, " n"]]
+"""Terminal speed in m/s of particles with diameters in metres."""
+
+
+class Distribution(Protocol):
+    """Particles per m^3 of air over their diameter, between two diameters."""
+
+    @property
+    def smallest(self) -> float: ...
+
+    @property
+    def largest(self) -> float: ...
+
+    def density(self, diameter: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
+        """N(D) in 1/m^4; 0 outside."""
+        ...
+
+    def moment(self, order: float) -> float:
+        """Integral of D^order N(D), in m^(order - 3)."""
+        ...
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
+        """Diameters of `count` particles in metres, drawn by number."""
+        ...
+
+    def scaled(self, factor: float) -> Distribution:
+        """As many times the particles, in the same sizes."""
+        ...
+
+
+D = TypeVar("D", bound=Distribution)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exponential:
+    """N(D) = intercept exp(-slope D) between two diameters."""
+
+    intercept: float
+    """1/m^4."""
+    slope: float
+    """1/m."""
+    smallest: float = 0.0
+    largest: float = math.inf
+
+    def __post_init__(self) -> None:
+        _check(self.smallest, self.largest)
+        if not (self.intercept > 0 and self.slope > 0):
+            raise ValueError(f"intercept and slope must be positive, got {self.intercept:g} /m^4 and {self.slope:g} /m")
+
+    def density(self, diameter: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
+        inside = (diameter >= self.smallest) & (diameter <= self.largest)
+        return np.where(inside, self.intercept * np.exp(-self.slope * diameter), 0.0)
+
+    def moment(self, order: float) -> float:
+        low, high = (float(gammainc(order + 1, self.slope * end)) for end in (self.smallest, self.largest))
+        return self.intercept * math.gamma(order + 1) / self.slope ** (order + 1) * (high - low)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
+        # Inverse of the distribution function, counted from the smallest so that large slopes lose no digits.
+        share = rng.uniform(size=count) * -math.expm1(-self.slope * (self.largest - self.smallest))
+        return self.smallest - np.log1p(-share) / self.slope
+
+    def scaled(self, factor: float) -> Exponential:
+        return replace(self, intercept=self.intercept * factor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogNormal:
+    """Diameters whose logarithm is normally distributed, between two diameters."""
+
+    number: float
+    """Particles per m^3, were there no smallest and largest."""
+    median: float
+    """Diameter below which half of that number lies, in metres."""
+    spread: float
+    """Geometric standard deviation, above 1."""
+    smallest: float = 0.0
+    largest: float = math.inf
+
+    def __post_init__(self) -> None:
+        _check(self.smallest, self.largest)
+        if not (self.number > 0 and self.median > 0 and self.spread > 1):
+            given = f"{self.number:g} /m^3, {self.median:g} m and {self.spread:g}"
+            raise ValueError(f"number and median must be positive and the geometric spread above 1, got {given}")
+
+    @staticmethod
+    def of_mass(mass: float, median: float, spread: float, material: float, **ends: float) -> LogNormal:
+        """From the diameter that halves the mass, as sieves and dust models state it (Hatch & Choate 1929).
+
+        Args:
+            mass: kg per m^3 of air, were there no smallest and largest.
+            median: of the mass, in metres.
+            material: density of a particle, kg/m^3.
+        """
+        by_number = median * math.exp(-3 * math.log(spread) ** 2)
+        each = LogNormal(number=1.0, median=by_number, spread=spread).moment(3) * math.pi / 6 * material
+        return LogNormal(number=mass / each, median=by_number, spread=spread, **ends)
+
+    @staticmethod
+    def of_effective(extinction: float, diameter: float, variance: float, **ends: float) -> LogNormal:
+        """From what light sees of particles (Hansen & Travis 1974), whatever the form of their distribution.
+
+        Args:
+            extinction: of visible light, per metre, were there no smallest and largest.
+            diameter: effective diameter (third over second moment) in metres.
+            variance: effective variance, relative to the square of the diameter.
+        """
+        median, spread = diameter * (1 + variance) ** -2.5, math.exp(math.sqrt(math.log1p(variance)))
+        each = LogNormal(number=1.0, median=median, spread=spread).moment(2) * math.pi / 2
+        return LogNormal(number=extinction / each, median=median, spread=spread, **ends)
+
+    def density(self, diameter: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
+        inside = (diameter >= self.smallest) & (diameter <= self.largest) & (diameter > 0)
+        safe = np.where(inside, diameter, self.median)
+        peak = self.number / (math.sqrt(2 * math.pi) * math.log(self.spread) * safe)
+        return np.where(inside, peak * np.exp(-0.5 * (np.log(safe / self.median) / math.log(self.spread)) ** 2), 0.0)
+
+    def moment(self, order: float) -> float:
+        width = math.log(self.spread)
+        low, high = (float(ndtr(self._standard(end) - order * width)) for end in (self.smallest, self.largest))
+        return self.number * self.median**order * math.exp(0.5 * (order * width) ** 2) * (high - low)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
+        low, high = (float(ndtr(self._standard(end))) for end in (self.smallest, self.largest))
+        drawn = self.median * self.spread ** ndtri(low + (high - low) * rng.uniform(size=count))
+        return drawn.clip(self.smallest, self.largest)  # round-off at the ends
+
+    def scaled(self, factor: float) -> LogNormal:
+        return replace(self, number=self.number * factor)
+
+    def _standard(self, diameter: float) -> float:
+        """Deviation from the median in standard deviations of the logarithm."""
+        if diameter <= 0 or math.isinf(diameter):
+            return -math.inf if diameter <= 0 else math.inf
+        return math.log(diameter / self.median) / math.log(self.spread)
+
+
+def marshall_palmer(rain_rate: float, *, smallest: float = 1e-4, largest: float = 6e-3) -> Exponential:
+    """Raindrops at `rain_rate` mm/h: N0 = 8000 per m^3 and mm, Lambda = 4.1 R^-0.21 per mm, D in 0.1-6 mm.
+
+    Their water, falling as raindrops do, brings not quite the rate they are named by: a sixth more at 1-10 mm/h,
+    a twentieth less at 200 mm/h; `with_rain_rate` makes it exact.
+
+    Raises:
+        ValueError: the rate is outside 0.1-200 mm/h.
+    """
+    if not 0.1 <= rain_rate <= 200.0:
+        raise ValueError(f"the rain rate must lie in 0.1-200 mm/h, got {rain_rate:g}; heavy rain brings 10-50")
+    return Exponential(intercept=8e6, slope=4100.0 * rain_rate**-0.21, smallest=smallest, largest=largest)
+
+
+def rain_rate(drops: Distribution, speed: Speed = rain_fall_speed) -> float:
+    """Water that falls through a horizontal plane, in mm/h."""
+    diameter = np.geomspace(max(drops.smallest, 1e-6), min(drops.largest, 7e-3), 4096)
+    flux = np.pi / 6 * diameter**3 * drops.density(diameter) * speed(diameter)  # m^3 of water per m^2, s and m of diameter
+    return 3.6e6 * float(trapezoid(flux, diameter))
+
+
+def with_rain_rate(drops: D, wanted: float, speed: Speed = rain_fall_speed) -> D:
+    """The same sizes, as many of them as bring `wanted` mm/h."""
+    return drops.scaled(wanted / rain_rate(drops, speed))  # type: ignore[return-value]
+
+
+def mass(particles: Distribution, material: float = WATER_DENSITY) -> float:
+    """kg of particles per m^3 of air, of spheres of `material` kg/m^3."""
+    return math.pi / 6 * material * particles.moment(3)
+
+
+def extinction(particles: Distribution) -> float:
+    """Extinction of visible light per metre: twice the cross section, for particles far larger than the wavelength."""
+    return 2 * math.pi / 4 * particles.moment(2)
+
+
+def visibility(particles: Distribution) -> float:
+    """Metres at which a black object fades to 2 % of contrast (Koschmieder 1924)."""
+    return math.log(50.0) / extinction(particles)
+
+
+def advection_fog() -> LogNormal:
+    """Dense fog that the wind brings from the sea: effective diameter 40 µm, visibility 140 m (Shettle & Fenn's model 1)."""
+    return LogNormal.of_effective(27.9e-3, 40e-6, 1 / 6, smallest=1e-6, largest=200e-6)
+
+
+def radiation_fog() -> LogNormal:
+    """Fog of a clear night over land: effective diameter 6 µm, visibility 500 m (Shettle & Fenn's model 4)."""
+    return LogNormal.of_effective(7.82e-3, 6e-6, 1 / 9, smallest=1e-6, largest=200e-6)
+
+
+def blown_sand(mass: float) -> LogNormal:
+    """`mass` kg per m^3 of medium and fine sand: median of the mass 158 µm, spread 2.0 (Tegen et al. 2002)."""
+    return LogNormal.of_mass(mass, 158e-6, 2.0, QUARTZ_DENSITY, smallest=20e-6, largest=2e-3)
+
+
+def coarse_sand(mass: float) -> LogNormal:
+    """`mass` kg per m^3 of coarse sand: median of the mass 707 µm, spread 2.0 (Tegen et al. 2002)."""
+    return LogNormal.of_mass(mass, 707e-6, 2.0, QUARTZ_DENSITY, smallest=20e-6, largest=5e-3)
+
+
+def desert_dust(mass: float) -> tuple[LogNormal, LogNormal, LogNormal]:
+    """`mass` kg per m^3 of dust that stays aloft when the sand has settled, in three modes (d'Almeida 1987, background)."""
+    first, second, third = (
+        LogNormal.of_mass(share * mass, median, spread, QUARTZ_DENSITY)
+        for share, median, spread in ((0.036, 0.832e-6, 2.1), (0.957, 4.82e-6, 1.9), (0.007, 19.38e-6, 1.6))
+    )
+    return first, second, third
+
+
+def _check(smallest: float, largest: float) -> None:
+    if not 0 <= smallest < largest:
+        raise ValueError(f"diameters must satisfy 0 <= smallest < largest, got {smallest:g} and {largest:g} m")

@@ -1,0 +1,148 @@
+"""Weather simulated in the air around a scene, from frame 0 to the last: its air is full at once or as its timeline has it.
+
+Frames are simulated in chunks. A chunk is a pure function of the state at its start, and the randomness of a frame comes from
+the seed and the number of the frame alone; so an interrupted run goes on from its last stored chunk and ends with the same
+bits.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.physics.air.air import Air
+from pgsd_nerfstudio.physics.air.arrival import Arrival
+from pgsd_nerfstudio.physics.air.deflection import Deflection
+from pgsd_nerfstudio.physics.air.emitters import Sizes
+from pgsd_nerfstudio.physics.air.sight import Sight
+from pgsd_nerfstudio.physics.air.wind import WindField
+from pgsd_nerfstudio.physics.bodies import RunState
+from pgsd_nerfstudio.physics.clock import Clock, Domain
+from pgsd_nerfstudio.physics.frames import simulate_chunk
+from pgsd_nerfstudio.physics.ground.deposits import Deposits
+from pgsd_nerfstudio.physics.ground.landing import Ground
+from pgsd_nerfstudio.physics.laws.populations import fall_speed
+from pgsd_nerfstudio.physics.record.chunks import Chunk, assemble, load_chunk, save_chunk
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.scene.cameras import Cameras
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+
+MAX_PARTICLES = 20_000  # in the air at once: what a CPU renders and refines in reasonable time
+CHUNK = 25  # frames that an interruption may cost
+SIGHT = 20.0  # m; a particle farther from every camera than this is not seen
+LEAST_GUSTS = 0.35  # gustiness that the region of sight allows for at least
+SIGHT_MARGIN = 0.5  # m around what cameras see: training clips leave their cameras' straight ways by no more
+
+console = Console(stderr=True, highlight=False)
+
+
+def simulate_metric(
+    surface: SurfaceMesh,
+    effect: Effect,
+    clock: Clock,
+    domain: Domain,
+    *,
+    seed: int = 0,
+    max_particles: int | None = None,
+    cameras: Cameras | None = None,
+    progress: bool = True,
+    resume: Path | None = None,
+) -> ParticleHistory:
+    """Simulate an effect in a box of air above a surface.
+
+    Args:
+        surface: what particles land on, in metres; may be empty, then nothing lands.
+        max_particles: most particles in the air at once; each then represents several real ones. None: MAX_PARTICLES.
+        cameras: in metres; particles that none of them can come to see are left out. None: all are simulated.
+        progress: show a bar.
+        resume: folder in which chunks are kept until the run is complete; None keeps nothing.
+
+    Raises:
+        ValueError: a quantity became NaN or infinite; the message names it and the frame.
+    """
+    max_particles = MAX_PARTICLES if max_particles is None else max_particles
+    if max_particles < 1:
+        raise ValueError(f"max_particles must be at least 1, got {max_particles}")
+    began = time.perf_counter()
+    starts = range(0, clock.frames, CHUNK)
+    chunks: list[Chunk] = []
+    state = RunState.empty()
+    with _one_thread(), _bar(progress) as bar:
+        air = Air(
+            domain=domain,
+            sizes=Sizes.of(effect, domain.volume, min(max_particles, effect.emission.most or max_particles)),
+            wind=WindField.draw(effect.wind, seed, Deflection.of(surface, domain, effect.wind)),
+            arrival=Arrival.of(effect.timeline, domain, effect.wind),
+            effect=effect,
+            ground=Ground.of(surface, effect.surface, domain),
+            sight=_sight(effect, domain, cameras),
+            step=clock.step,
+            seed=seed,
+        )
+        deposits = Deposits(effect, surface, domain)
+        task = bar.add_task(f"simulating {effect.name}", total=clock.frames)
+        for index, start in enumerate(starts):
+            frames = min(CHUNK, clock.frames - start)
+            chunk = load_chunk(resume, index, start, frames) if resume is not None else None
+            if chunk is None:
+                chunk = simulate_chunk(air, deposits, state, start, frames)
+                if resume is not None and not save_chunk(resume, index, chunk):
+                    last = start + frames - 1
+                    console.print(f"[yellow]could not store frames {start}-{last} in {resume}: going on[/]", soft_wrap=True)
+                    resume = None
+            chunks.append(chunk)
+            state = chunk.state
+            bar.update(task, completed=start + frames)
+    deposits.restore(state.deposits)  # the last chunk may have come from the disk
+    about = {
+        "profile": "metric",
+        "effect": effect.name,
+        "seed": seed,
+        "intensity": effect.emission.intensity,
+        "unit": effect.emission.unit,
+        "domain": [*domain.lower, *domain.upper],
+        "air_simulated": air.sight.share,
+        **deposits.summary(),
+        "seconds": time.perf_counter() - began,
+    }
+    history = assemble(chunks, clock, about)
+    history.check_finite()
+    return history
+
+
+def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
+    if cameras is None:
+        return Sight.everything()
+    # Around obstacles the wind turns aside and up, which the region knows nothing of; the allowance for gusts covers it.
+    wind = replace(effect.wind, gustiness=max(effect.wind.gustiness, LEAST_GUSTS))
+    ends = np.array([effect.emission.smallest, effect.emission.largest])
+    slowest, fastest = (float(speed) for speed in np.sort(fall_speed(ends, effect.material)))
+    return Sight.of(domain, cameras, distance=SIGHT, margin=SIGHT_MARGIN, slowest=slowest, fastest=fastest, wind=wind)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch with one thread: arrays are so small here that several would wait for each other longer than they work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _bar(show: bool) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, disable=not show, transient=True)

@@ -1,0 +1,107 @@
+"""The teacher of a run: video prior, prompts and noise schedule, from a rendered clip to the gradient on its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from pgsd_nerfstudio.guidance.distillation import DistillationConfig, DistilledClip, distill_clip
+from pgsd_nerfstudio.guidance.folder import find_folder, find_prior, read_config
+from pgsd_nerfstudio.guidance.prompts import embed_texts, prompts_for
+from pgsd_nerfstudio.guidance.schedules import TimestepSchedule
+from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
+from pgsd_nerfstudio.guidance.variants import Embeddings
+from pgsd_nerfstudio.guidance.video_prior import VideoPrior
+from pgsd_nerfstudio.guidance.wan import WanPrior
+from pgsd_nerfstudio.guidance.wan_parts import find_wan, is_wan
+from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.options import WeatherOptions
+
+PAPER_FRAMES = 9
+
+console = Console(stderr=True, highlight=False)
+
+
+@dataclass(frozen=True)
+class Distiller:
+    """An opened video prior that has heard what is wanted."""
+
+    prior: VideoPrior
+    wanted: str
+    unwanted: str
+    embeddings: Embeddings
+    """Of all texts that the kind of distillation asks about, by role."""
+    distillation: DistillationConfig
+    timesteps: TimestepSchedule
+    steps: int
+    seed: int
+
+    @staticmethod
+    def listening(prior: VideoPrior, options: WeatherOptions, description: str) -> Distiller:
+        """A distiller toward the effect's prompt for a scene that is called `description`.
+
+        Raises:
+            RunError: the text encoder cannot be used.
+        """
+        effect = options.chosen_effect()
+        unwanted = effect.negative_prompt if options.negative_prompt is None else options.negative_prompt
+        prompts = prompts_for(effect.name, options.prompt or effect.prompt, unwanted, description)
+        try:
+            embeddings = embed_texts(prior, prompts.needed(options.distillation.variant))
+        except (ValueError, OSError) as error:
+            raise RunError(str(error)) from error
+        steps, seed = options.training_steps, options.training_seed
+        return Distiller(prior, prompts.text, unwanted, embeddings, options.distillation, TimestepSchedule(), steps, seed)
+
+    def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:
+        """Which way the clip should change, in training step `step`; the noise depends on the seed and the step only.
+
+        Raises:
+            RunError: the prior cannot take clips of this shape.
+            FloatingPointError: its prediction is not finite.
+        """
+        draw = torch.Generator().manual_seed(1_000_003 * self.seed + step)
+        timestep = self.timesteps.sample(step, self.steps, draw)
+        how = {"config": self.distillation, "generator": draw, "progress": step / self.steps}
+        try:
+            return distill_clip(self.prior, clip, self.embeddings, None, timestep, **how)
+        except ValueError as error:
+            raise RunError(str(error)) from error
+
+
+def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[VideoPrior, WeatherOptions]:
+    """The video prior of a run, and the options with the size of the training clips settled.
+
+    Raises:
+        RunError: the prior cannot be used, or the weather is shorter than a clip.
+    """
+    try:
+        folder = find_folder(options.prior)
+        kind, judged = (WanPrior, find_wan) if is_wan(folder) else (VideoPrior, find_prior)
+        native = int(read_config(judged(folder), "transformer").get("sample_frames", PAPER_FRAMES))
+        prior = kind.load(folder, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
+        if options.tiny_vae is not None:
+            prior = _through_tiny(prior, options.tiny_vae)
+    except (ValueError, OSError) as error:
+        raise RunError(str(error)) from error
+    frames, height, width = prior.clip_shape
+    if options.frames < frames:
+        raise RunError(
+            f"the weather has {options.frames} frames ({options.seconds:g} s), a training clip {frames}: use more --seconds"
+        )
+    sizes = {"clip_height": options.clip_height or height, "clip_width": options.clip_width or width}
+    return prior, replace(options, clip_frames=frames, **sizes)
+
+
+def _through_tiny(prior: VideoPrior, weights: Path) -> VideoPrior:
+    """The prior with a tiny encoder before it; says how far their gradients agree on a clip of noise in the prior's size."""
+    tiny = TinyEncoder.load(weights, prior.device, prior.dtype)
+    frames, height, width = prior.clip_shape
+    clip = torch.rand(frames, 3, height, width, generator=torch.Generator().manual_seed(0)).to(prior.device)
+    console.print(f"tiny VAE {weights.name}: cosine of its gradient with the full one {gradient_cosine(prior, tiny, clip):.3f}")
+    return prior.through(tiny)
