@@ -1,4 +1,4 @@
-"""What moves: reference trajectories of weather particles, the motion prior."""
+"""Physics of weather particles: it simulates their trajectories, the motion prior."""
 
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Clock, Domain, domain_of

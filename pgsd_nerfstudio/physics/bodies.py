@@ -1,4 +1,7 @@
-"""Particles on their way, and everything that the next frame of a simulation depends on."""
+"""Active particles, and everything that the next frame of a simulation depends on.
+
+A particle is active while it moves: it flies, slides, or is part of dense matter.
+"""
 
 from __future__ import annotations
 
@@ -10,31 +13,36 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 GRAVITY = 9.81  # m/s^2, in all motion here; the fits in laws.fall_speeds were made with the standard 9.80665
-LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; what ended none of these ways still moves
+LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; a particle that has not ended is active
 ENDS = {"landed": LANDED, "absorbed": ABSORBED, "left": LEFT, "unseen": UNSEEN}
-SPLASHED, SLID, DENSE = 1, 2, 4  # bits of what a particle ever was: droplet of a splash, sliding, dense matter
+SPLASHED, SLID, DENSE = 1, 2, 4  # bits of `kinds`: the particle is a splash droplet, has slid, has been dense matter
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """n particles on their way; what one of them needs to go on."""
+    """n active particles with all that their motion depends on."""
 
     ids: Int[ndarray, " n"]
     positions: Float[ndarray, "n 3"]
+    """Metres."""
     velocities: Float[ndarray, "n 3"]
+    """m/s."""
     diameters: Float[ndarray, " n"]
+    """Metres."""
     speeds: Float[ndarray, " n"]
-    """Terminal, m/s."""
+    """Terminal speeds, m/s."""
     sways: Float[ndarray, " n"]
-    """Flutter: speed in m/s, rate in Hz, phase in turns."""
+    """Speed of the flutter, m/s."""
     hertz: Float[ndarray, " n"]
+    """Rate of the flutter, Hz; its sign is the sense of rotation."""
     phases: Float[ndarray, " n"]
+    """Phase of the flutter, turns."""
     holds: Float[ndarray, " n"]
-    """Draw from 0..1 that decides whether it stays on a slope."""
+    """Draws from 0..1 that decide whether a particle stays on a slope."""
     spins: Float[ndarray, " n"]
-    """Turns about the normal when it lies."""
+    """Turns about the surface normal after landing."""
     represents: Float[ndarray, " n"]
-    """Real particles that it stands for."""
+    """Real particles that each particle represents."""
     kinds: Int[ndarray, " n"]
     """Bits SPLASHED, SLID and DENSE."""
 
@@ -42,18 +50,21 @@ class Bodies:
         return len(self.ids)
 
     def select(self, which: ndarray) -> Bodies:
+        """The particles that a mask or an array of indices chooses."""
         return Bodies(*(getattr(self, f.name)[which] for f in fields(self)))
 
     @staticmethod
     def join(parts: Sequence[Bodies]) -> Bodies:
+        """All particles of the parts, in their order, as new arrays."""
         return Bodies(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Bodies)))
 
     def marked(self, kind: int) -> Bodies:
-        """The same particles, which now have been of that kind too."""
+        """The same particles with the bit `kind` (SPLASHED, SLID or DENSE) set."""
         return replace(self, kinds=self.kinds | np.uint8(kind))
 
     @staticmethod
     def none() -> Bodies:
+        """No particles."""
         widths = {"positions": (0, 3), "velocities": (0, 3)}
         types = {"ids": np.int32, "kinds": np.uint8}
         return Bodies(*(np.zeros(widths.get(f.name, 0), types.get(f.name, np.float32)) for f in fields(Bodies)))
@@ -61,36 +72,43 @@ class Bodies:
 
 @dataclass(frozen=True)
 class RunState:
-    """Everything the next frame depends on."""
+    """Everything that the next frame depends on."""
 
     flying: Bodies
     sliding: Bodies
     dense: Bodies
     deposits: Mapping[str, ndarray]
-    """What lies on surfaces, and the dense matter's own state: see `deposits.Deposits`."""
+    """State of cover, wetness and dense matter; see `deposits.Deposits`."""
     born: int
-    """Particles so far; the next id."""
+    """Number of particles so far, which is the next id."""
     carry: float
-    """Fraction of a particle that is due at the top."""
+    """Fraction of a particle that is due to enter through the top."""
 
     @staticmethod
     def empty() -> RunState:
+        """The state before the first frame."""
         return RunState(Bodies.none(), Bodies.none(), Bodies.none(), {}, 0, 0.0)
 
     @property
     def moving(self) -> int:
-        """Particles on their way."""
+        """Number of active particles."""
         return len(self.flying) + len(self.sliding) + len(self.dense)
 
     def arrays(self) -> dict[str, ndarray]:
-        """All arrays by name."""
+        """All arrays by name; `of` reads them back."""
         groups = {"flying": self.flying, "sliding": self.sliding, "dense": self.dense}
         named = {f"{group}.{f.name}": getattr(bodies, f.name) for group, bodies in groups.items() for f in fields(Bodies)}
         return named | {f"deposits.{name}": value for name, value in self.deposits.items()}
 
     @staticmethod
     def of(arrays: Mapping[str, ndarray], born: int, carry: float) -> RunState:
-        """From what `arrays` gave."""
+        """Rebuild a state.
+
+        Args:
+            arrays: what the method `arrays` returned.
+            born: number of particles so far.
+            carry: fraction of a particle that is due to enter through the top.
+        """
         flying, sliding, dense = (
             Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in ("flying", "sliding", "dense")
         )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Clock:
-    """Rendered time steps; frame f shows the instant f / fps."""
+    """Rendered time steps. Frame f shows the instant f / fps."""
 
     fps: float = 25.0
     frames: int = 250
@@ -50,22 +50,23 @@ class Domain:
 
     @property
     def area(self) -> float:
-        """Of the horizontal cross-section, m^2."""
+        """Area of the horizontal cross-section, m^2."""
         return self.size[0] * self.size[1]
 
     @property
     def volume(self) -> float:
+        """m^3."""
         return self.area * self.size[2]
 
 
-LOOK_AHEAD = 5.0  # m; how far in front of a camera there should be weather: beyond, flakes are fainter than a grain of noise
-MARGIN = 1.5  # m around cameras and what they look at, so that flakes pass close to the lens too
+LOOK_AHEAD = 5.0  # m; how far the domain reaches in front of a camera: flakes farther away are fainter than noise
+MARGIN = 1.5  # m around the cameras and the points before them, so that flakes pass close to the lens too
 ABOVE = 2.0  # m above the highest camera
-WIDEST = 20.0  # m; a wider box would thin the particles out beyond use
+WIDEST = 20.0  # m; a wider domain would thin the particles out beyond use
 
 
 def domain_of(scene: Scene) -> Domain:
-    """The box of air that the scene's cameras look through, from the ground to above the highest of them."""
+    """The domain that the scene's cameras look through, from the ground to above the highest camera."""
     cameras = scene.cameras
     centers = scene.frame.to_metric(cameras.centers.float()).cpu().numpy().astype(np.float64)
     forward = cameras.viewmats[:, 2, :3].float() @ scene.frame.rotation.to(cameras.viewmats.device).float().T

@@ -1,4 +1,4 @@
-"""From one frame to the next: fly, meet the surface, slide, move as a whole, leave, enter."""
+"""One frame of a simulation: particles fly, make contact, slide, move as dense matter, leave and enter."""
 
 from __future__ import annotations
 
@@ -16,88 +16,95 @@ from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.chunks import Chunk
 from pgsd_nerfstudio.physics.record.log import Log
 
-CLEAR = 0.01  # m off the surface at which what glides along it goes on
+CLEAR = 0.01  # m above the surface at which a gliding particle (fog) flies on after a contact
 
 
 def simulate_chunk(air: Air, deposits: Deposits, state: RunState, start: int, frames: int) -> Chunk:
-    """Simulate `frames` frames from `start` on.
+    """Simulate the frames of one chunk.
+
+    Args:
+        air: what does not change during the run.
+        deposits: cover, wetness and dense matter; they take the state's values and change with the frames.
+        state: the state before the first frame.
+        start: first frame.
+        frames: number of frames.
 
     Raises:
         ValueError: a position or velocity became NaN or infinite.
     """
     deposits.restore(state.deposits)
     log = Log(start, frames, state.born)
-    walk = _Walk(air, deposits, log, state)
+    simulation = _Simulation(air, deposits, log, state)
     for frame in range(start, start + frames):
-        walk.begin() if frame == 0 else walk.advance(frame)
-    return log.chunk(air.ground, air.seed, walk.state())
+        simulation.begin() if frame == 0 else simulation.advance(frame)
+    return log.chunk(air.ground, air.seed, simulation.state())
 
 
-class _Walk:
-    """Particles on their way through the frames of a chunk."""
+class _Simulation:
+    """Active particles during the frames of one chunk."""
 
     def __init__(self, air: Air, deposits: Deposits, log: Log, state: RunState) -> None:
         self.air, self.deposits, self.log = air, deposits, log
-        self.flying = Bodies.join([state.flying])  # a copy: flying changes it in place
+        self.flying = Bodies.join([state.flying])  # a copy, since `Air.fly` changes arrays in place
         self.sliding, self.dense, self.carry = state.sliding, state.dense, state.carry
 
     def state(self) -> RunState:
         return RunState(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born, self.carry)
 
     def begin(self) -> None:
-        """Frame 0: what is in the air from the start."""
+        """Frame 0: particles that are in the air from the start enter."""
         self.flying = self.log.enter(self.air.arriving(0), 0)
 
     def advance(self, frame: int) -> None:
-        """From the frame before to `frame`."""
+        """Advance from the frame before to `frame`."""
         air, log = self.air, self.log
         before = self.flying.positions.copy()
         air.fly(self.flying, frame)
-        meeting = air.ground.meet(before, self.flying.positions, self.deposits.cover)
-        self.flying.positions[meeting.which] = meeting.points
-        aloft, gone = self._leave(meeting, frame)
+        contacts = air.ground.meet(before, self.flying.positions, self.deposits.cover)
+        self.flying.positions[contacts.which] = contacts.points
+        free, left = self._leave(contacts, frame)
         took_off = self._slide(frame)
         self._move_dense(frame)
-        touched = self.flying.select(meeting.which)
-        flying, droplets = self._touch(touched, meeting, frame)
-        entering, self.carry = air.entering(gone, self.carry, frame)
-        log.see(aloft, frame)
-        stay = Bodies.join([aloft, took_off, flying])
+        in_contact = self.flying.select(contacts.which)
+        gliding, droplets = self._resolve_contacts(in_contact, contacts, frame)
+        entering, self.carry = air.entering(left, self.carry, frame)
+        log.see(free, frame)
+        stay = Bodies.join([free, took_off, gliding])
         self.flying = Bodies.join([stay, log.enter(droplets, frame), log.enter(entering, frame)])
         self.deposits.age(air.step)
         for bodies in (self.flying, self.sliding, self.dense):
             _check(bodies, frame)
 
-    def _leave(self, meeting: Meeting, frame: int) -> tuple[Bodies, Bodies]:
-        """What stays in the air untouched, and what left the box of air.
+    def _leave(self, contacts: Meeting, frame: int) -> tuple[Bodies, Bodies]:
+        """Particles that fly on without a contact, and particles that left the domain.
 
-        What no camera can see any more ends too, and what flew out ahead of the weather's front.
+        A particle also ends when no camera can see it any more, and when it flies out ahead of the weather's front.
         """
         air, bodies, log = self.air, self.flying, self.log
         lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
         out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
-        touched = np.zeros(len(bodies), bool)
-        touched[meeting.which] = True
-        ahead = ~touched & ~out & ~air.arrival.passed(bodies.positions, frame * air.step)
-        unseen = ~(touched | out | ahead) & ~air.sight.needed(bodies.positions)
-        gone = bodies.select(out & ~touched)
-        log.end(gone, frame, LEFT)
+        contact = np.zeros(len(bodies), bool)
+        contact[contacts.which] = True
+        ahead = ~contact & ~out & ~air.arrival.passed(bodies.positions, frame * air.step)
+        unseen = ~(contact | out | ahead) & ~air.sight.needed(bodies.positions)
+        left = bodies.select(out & ~contact)
+        log.end(left, frame, LEFT)
         log.end(bodies.select(ahead), frame, LEFT)
         log.end(bodies.select(unseen), frame, UNSEEN)
-        return bodies.select(~(touched | out | ahead | unseen)), gone
+        return bodies.select(~(contact | out | ahead | unseen)), left
 
     def _slide(self, frame: int) -> Bodies:
-        """Move sliders; returns those that fly again. Those that found rest lie down."""
+        """Move sliders and land the slow ones; returns the sliders that fly again."""
         air, log = self.air, self.log
         moved = slide(self.sliding, air.ground.surface, air.effect.surface.friction, air.step)
         log.see(moved.bodies, frame)
         rests = moved.rests
-        self._lie(moved.bodies.select(rests), frame)
+        self._land(moved.bodies.select(rests), frame)
         self.sliding = moved.bodies.select(~(rests | moved.flies))
         return moved.bodies.select(moved.flies)
 
     def _move_dense(self, frame: int) -> None:
-        """Hand crowded sliders over, and move what is dense as a whole."""
+        """Move dense matter and add crowded sliders to it."""
         matter, log = self.deposits.dense, self.log
         if matter is None:
             return
@@ -112,7 +119,7 @@ class _Walk:
             )
             log.see(bodies.select(~moved.left), frame)
             log.end(bodies.select(moved.left), frame, LEFT)
-            self._lie(bodies.select(moved.rests), frame, heaped=True)
+            self._land(bodies.select(moved.rests), frame, heaped=True)
             self.dense = bodies.select(~(moved.rests | moved.left))
         if crowded.any():
             handed = self.sliding.select(crowded).marked(DENSE)
@@ -121,47 +128,51 @@ class _Walk:
             self.sliding = self.sliding.select(~crowded)
             self.dense = Bodies.join([self.dense, handed])
 
-    def _touch(self, touched: Bodies, meeting: Meeting, frame: int) -> tuple[Bodies, Bodies]:
-        """What happens to particles at their contacts; returns those that fly on, and new droplets without ids."""
+    def _resolve_contacts(self, bodies: Bodies, contacts: Meeting, frame: int) -> tuple[Bodies, Bodies]:
+        """Let particles glide on, end, land or slide at their contacts, as the effect has it.
+
+        Returns:
+            The particles that glide on, and the new droplets of splashes, which have no ids yet.
+        """
         air, log, response = self.air, self.log, self.air.effect.surface
-        log.see(touched, frame)
+        log.see(bodies, frame)
         if response.landing == "glides":
-            into = (touched.velocities * meeting.normals).sum(1, keepdims=True)
+            into = (bodies.velocities * contacts.normals).sum(1, keepdims=True)
             return (
                 replace(
-                    touched,
-                    positions=(touched.positions + CLEAR * meeting.normals).astype(np.float32),
-                    velocities=(touched.velocities - into * meeting.normals).astype(np.float32),
+                    bodies,
+                    positions=(bodies.positions + CLEAR * contacts.normals).astype(np.float32),
+                    velocities=(bodies.velocities - into * contacts.normals).astype(np.float32),
                 ),
                 Bodies.none(),
             )
         if response.landing in ("wets", "vanishes"):
-            droplets, share = Bodies.none(), np.zeros(len(touched))
+            droplets, share = Bodies.none(), np.zeros(len(bodies))
             if response.splash is not None:
                 rng = air.draws(frame, 0x59A5)
-                droplets, share = splashed(air, response.splash, touched, meeting.normals, rng)
-            self.deposits.wet(touched, 1 - share)
-            log.end(touched, frame + 1, ABSORBED)
+                droplets, share = splashed(air, response.splash, bodies, contacts.normals, rng)
+            self.deposits.wet(bodies, 1 - share)
+            log.end(bodies, frame + 1, ABSORBED)
             return Bodies.none(), droplets
-        hold = air.ground.holds(meeting.normals, touched.holds)
-        self._lie(touched.select(hold), frame)
-        slips = touched.select(~hold).marked(SLID)
-        normals = meeting.normals[~hold]
+        hold = air.ground.holds(contacts.normals, bodies.holds)
+        self._land(bodies.select(hold), frame)
+        slips = bodies.select(~hold).marked(SLID)
+        normals = contacts.normals[~hold]
         along = slips.velocities - (slips.velocities * normals).sum(1, keepdims=True) * normals
-        # Off the surface, on the side from which they came: sliding has no other memory of it.
+        # A slider's position alone tells on which side of the surface it is, so it is lifted to the side it came from.
         lifted = slips.positions + LIFT * normals
         slips = replace(slips, positions=lifted.astype(np.float32), velocities=along.astype(np.float32))
         log.become(slips)
         self.sliding = Bodies.join([self.sliding, slips])
         return Bodies.none(), Bodies.none()
 
-    def _lie(self, bodies: Bodies, frame: int, *, heaped: bool = False) -> None:
-        """Particles whose way ends here, on the cover that they make thicker."""
+    def _land(self, bodies: Bodies, frame: int, *, heaped: bool = False) -> None:
+        """Land particles on the cover, which they make thicker; see `Deposits.lay` for `heaped`."""
         cover = self.deposits.cover
         before = np.zeros(len(bodies)) if cover is None else cover.height(bodies.positions.astype(np.float64))
         covers = self.deposits.lay(bodies, heaped=heaped)
         if not heaped:
-            # They touched the cover as it was, and lie on it as it has become: the surface beneath is where it was.
+            # Contacts were made with the cover before it grew. Particles rise with it; the surface beneath has not moved.
             bodies = replace(bodies, positions=bodies.positions.copy())
             bodies.positions[:, 2] += (covers - before).astype(np.float32)
         self.log.land(bodies, covers, frame)

@@ -1,8 +1,8 @@
-"""Weather simulated in the air around a scene, from frame 0 to the last: its air is full at once or as its timeline has it.
+"""Simulation of weather in the air around a scene in metric units.
 
 Frames are simulated in chunks. A chunk is a pure function of the state at its start, and the randomness of a frame comes from
-the seed and the number of the frame alone; so an interrupted run goes on from its last stored chunk and ends with the same
-bits.
+the seed and the number of the frame alone. An interrupted run therefore goes on from its last stored chunk and ends with the
+same bits.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-MAX_PARTICLES = 20_000  # in the air at once: what a CPU renders and refines in reasonable time
-CHUNK = 25  # frames that an interruption may cost
+MAX_PARTICLES = 20_000  # flying at once; a CPU renders and refines that many in reasonable time
+CHUNK = 25  # frames; an interruption loses at most that many
 SIGHT = 20.0  # m; a particle farther from every camera than this is not seen
-LEAST_GUSTS = 0.35  # gustiness that the region of sight allows for at least
-SIGHT_MARGIN = 0.5  # m around what cameras see: training clips leave their cameras' straight ways by no more
+LEAST_GUSTS = 0.35  # smallest gustiness that the region of sight allows for
+SIGHT_MARGIN = 0.5  # m around views; the cameras of training clips stray no farther from the straight paths between cameras
 
 console = Console(stderr=True, highlight=False)
 
@@ -60,17 +60,25 @@ def simulate_metric(
     progress: bool = True,
     resume: Path | None = None,
 ) -> ParticleHistory:
-    """Simulate an effect in a box of air above a surface.
+    """Simulate an effect in a domain above a surface.
 
     Args:
-        surface: what particles land on, in metres; may be empty, then nothing lands.
-        max_particles: most particles in the air at once; each then represents several real ones. None: MAX_PARTICLES.
-        cameras: in metres; particles that none of them can come to see are left out. None: all are simulated.
+        surface: the mesh that particles land on, in metres. On an empty one nothing lands.
+        effect: the weather.
+        clock: frame rate and number of frames.
+        domain: the simulated air, in metres.
+        seed: of all random numbers.
+        max_particles: most particles in the air at once; each then represents several real particles. None: MAX_PARTICLES.
+        cameras: in metres. Particles that cannot come into the view of any of them are left out. None: all are simulated.
         progress: show a bar.
-        resume: folder in which chunks are kept until the run is complete; None keeps nothing.
+        resume: folder that keeps chunks until the run is complete. None keeps nothing.
+
+    Returns:
+        The trajectories in metres; `about` holds the settings, totals of the deposits and counts of how particles ended.
 
     Raises:
-        ValueError: a quantity became NaN or infinite; the message names it and the frame.
+        ValueError: `max_particles` is less than 1, or a quantity became NaN or infinite; then the message names the quantity
+            and the frame.
     """
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
     if max_particles < 1:
@@ -125,7 +133,7 @@ def simulate_metric(
 def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
     if cameras is None:
         return Sight.everything()
-    # Around obstacles the wind turns aside and up, which the region knows nothing of; the allowance for gusts covers it.
+    # The region of sight does not know that obstacles deflect the wind; the allowance for gusts covers that.
     wind = replace(effect.wind, gustiness=max(effect.wind.gustiness, LEAST_GUSTS))
     ends = np.array([effect.emission.smallest, effect.emission.largest])
     slowest, fastest = (float(speed) for speed in np.sort(fall_speed(ends, effect.material)))
@@ -134,7 +142,7 @@ def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Torch with one thread: arrays are so small here that several would wait for each other longer than they work."""
+    """Run torch with one thread: the arrays here are so small that several threads would mostly wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,4 +1,4 @@
-"""The motion prior of a scene: simulated once, then read from the cache."""
+"""The motion prior of a scene. It is simulated once and then read from the cache."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 Profile = Literal["metric", "paper"]
-_REVISION = 4  # of what is computed; a stored history of another revision is not used
+_REVISION = 4  # of the computation; a stored history of another revision is not used
 
 
 def motion_prior(
@@ -35,16 +35,25 @@ def motion_prior(
     cache: bool = True,
     progress: bool = True,
 ) -> ParticleHistory:
-    """The simulated motion of an effect in a scene; simulated once and then read from the cache.
+    """The simulated motion of an effect in a scene. It is simulated once and then read from the cache.
 
-    An interrupted simulation goes on where it was (not the paper's); a damaged file is made again. Prints one line about the
-    result.
+    An interrupted simulation goes on where it stopped, except that of the paper. A damaged file is replaced.
 
     Args:
-        profile: `metric`, or `paper` for MPM throughout with the published numbers. The paper's simulation lasts 500 frames;
-        the
-            clock's are the first of them.
-        everything: simulate also what none of the scene's cameras can see.
+        scene: its cameras bound the simulated air.
+        surface: the mesh that particles land on, in metres.
+        effect: the weather.
+        clock: frame rate and number of frames.
+        seed: of all random numbers.
+        max_particles: most particles in the air at once. None: MAX_PARTICLES.
+        profile: `metric`, or `paper` for MPM throughout with the published numbers. The paper's simulation lasts 500 frames, of
+            which the clock takes the first.
+        everything: also simulate particles that none of the scene's cameras can see.
+        cache: read and write the cache.
+        progress: show a bar, then print one line about the result.
+
+    Raises:
+        ValueError: see `simulate_metric` and `paper.simulate_paper`.
     """
     domain = domain_of(scene)
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
@@ -84,7 +93,7 @@ def motion_prior(
 
 
 def summary(history: ParticleHistory) -> str:
-    """One line: how many particles, how many at once, what became of them, what each stands for, how long it took."""
+    """One line about a history: numbers of particles in all and at once, how they ended, what each represents, and the time."""
     births, ends = history.births.numpy(force=True), history.ends.numpy(force=True)
     change = np.bincount(births, minlength=history.frames + 1) - np.bincount(ends, minlength=history.frames + 1)
     active = np.cumsum(change)[: history.frames]
@@ -108,7 +117,7 @@ def summary(history: ParticleHistory) -> str:
 def _paper(
     scene: Scene, surface: SurfaceMesh, effect: Effect, clock: Clock, domain: Domain, seed: int, progress: bool
 ) -> ParticleHistory:
-    """The paper's simulation of the effect of that name; the scene's Gaussians within the domain are its obstacles."""
+    """The paper's simulation of the effect with that name. The scene's Gaussians within the domain are its obstacles."""
     from pgsd_nerfstudio.physics.paper import paper_config, simulate_paper  # starts Taichi
 
     means = scene.frame.to_metric(scene.gaussians.means.float()).cpu().numpy().astype(np.float64)

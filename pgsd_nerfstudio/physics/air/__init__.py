@@ -1,1 +1,1 @@
-"""What happens in the air: wind, what comes in, flight, what cameras can see of it."""
+"""Physics of the air: wind, particles that enter, flight, splashes, and the air that cameras can see."""

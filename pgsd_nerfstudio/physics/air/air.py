@@ -1,9 +1,10 @@
-"""The air of a run, and what comes into it: there from the start or when the weather arrives, then fed through the top and from
-where the wind blows.
+"""The air of a run and the particles that enter it: at the start or when the weather arrives, then through the top and the
+sides.
 
-A weather that comes behind a front is steady weather of which only what lies behind the front is there. So in each frame comes
-what was ahead of the front and is behind it now, drawn from steady air; and what the wind carries out ahead of the front ends.
-The air behind it thus holds what steady air does, whether the wind is faster than the front or slower.
+Weather behind a front is steady weather cut off at the front: no particle is ahead of it. In each frame the particles enter
+that the front has passed since the frame before, drawn from steady air. Particles that the wind carries ahead of the front
+end. The air behind the front therefore holds as many particles as steady air, whether the wind is faster than the front or
+slower.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ARRIVING, SHOWN, AHEAD, WALK, WALK_AHEAD = 0xA221, 0x5404, 0xF207, 0xD1FF, 0xD1F
 
 @dataclass(frozen=True)
 class Air:
-    """What does not change during a run."""
+    """Everything that does not change during a run."""
 
     domain: Domain
     sizes: Sizes
@@ -40,32 +41,51 @@ class Air:
     ground: Ground
     sight: Sight
     step: float
+    """Seconds from frame to frame."""
     seed: int
 
     def draws(self, frame: int, purpose: int = 0x5704) -> np.random.Generator:
-        """The randomness of one frame and purpose; the same however the run came there."""
+        """Random numbers that depend on the seed, the frame and the purpose alone, not on how the run reached the frame."""
         return np.random.default_rng([self.seed, frame, purpose])
 
     def settled(self, positions: ndarray, speeds: ndarray, time: float) -> Float[ndarray, "n 3"]:
-        """Velocity at which drag and gravity balance."""
+        """Velocity in m/s at which drag and gravity balance: the wind plus the terminal velocity.
+
+        Args:
+            positions: [n, 3] m.
+            speeds: [n] terminal speeds, m/s.
+            time: s.
+        """
         velocity = self.wind.velocity(positions.astype(np.float64), time)
         velocity[:, 2] -= speeds
         return velocity
 
     def shadowed(self, positions: ndarray, speeds: ndarray, time: float) -> ndarray:
-        """Which of new particles could not have come here, because something stands in their way from the sky.
+        """Which new particles cannot be where they are because the surface blocks their path from the sky, [n].
 
-        Fog that flows along surfaces comes everywhere.
+        Fog, which glides along surfaces, reaches every place.
+
+        Args:
+            positions: [n, 3] m.
+            speeds: [n] terminal speeds, m/s.
+            time: s.
         """
         if self.effect.surface.landing == "glides":
             return np.zeros(len(positions), bool)
-        # Of the undisturbed wind: in the updraft before a wall the deflected one would have it come from the ground.
+        # The undisturbed wind is taken: with the updraft before a wall, particles would seem to come from the ground.
         came = self.wind.undisturbed.velocity(positions.astype(np.float64), time)
         came[:, 2] -= speeds
         return ~self.ground.open_above(positions, -came)
 
     def newborn(self, positions: ndarray, diameters: ndarray, velocities: ndarray, rng: np.random.Generator) -> Bodies:
-        """Particles still without ids."""
+        """New particles without ids.
+
+        Args:
+            positions: [n, 3] m.
+            diameters: [n] m.
+            velocities: [n, 3] m/s.
+            rng: draws flutter, hold and spin.
+        """
         count, wind = len(diameters), self.effect.wind
         speeds = fall_speed(diameters, self.effect.material)
         draw = rng.uniform(size=(5, count))
@@ -87,7 +107,13 @@ class Air:
         )
 
     def fly(self, bodies: Bodies, frame: int, purpose: int = WALK) -> None:
-        """Carry particles from the frame before to `frame`, in place; `purpose` is that of their random walk."""
+        """Move flying particles from the frame before to `frame`.
+
+        Args:
+            bodies: the particles; positions and velocities are changed in place.
+            frame: the frame they arrive at.
+            purpose: of the draws for their random walk.
+        """
         flutter = Flutter(bodies.sways, bodies.hertz, bodies.phases)
         advance(bodies.positions, bodies.velocities, bodies.speeds, flutter, self.wind, (frame - 1) * self.step, self.step)
         spread = np.sqrt(2 * self.effect.wind.diffusivity * self.step)
@@ -96,47 +122,56 @@ class Air:
             bodies.positions[:] += walk.astype(np.float32)
 
     def arriving(self, frame: int) -> Bodies:
-        """What is in the air in `frame` because the weather has just come to it there; without an onset all, in frame 0."""
+        """New particles in places that the weather has reached since the frame before; without an onset all, in frame 0."""
         if (frame - 1) * self.step >= self.effect.timeline.onset:
             return Bodies.none()
-        return self._overtaken(frame) if self.arrival.is_front else self._risen(frame)
+        return self._passed_by_front(frame) if self.arrival.is_front else self._reached(frame)
 
     def entering(self, gone: Bodies, carry: float, frame: int) -> tuple[Bodies, float]:
-        """New particles: through the top, opposite to where others (`gone`) left through a side, where the weather arrives."""
+        """New particles of a frame: through the top, through the sides, and where the weather arrives.
+
+        Args:
+            gone: particles that left the domain; each is replaced by one that enters at the opposite side.
+            carry: fraction of a particle that is due to enter through the top.
+            frame: the frame in which they enter.
+
+        Returns:
+            The particles, without ids, and the fraction of a particle to carry over to the next frame.
+        """
         if self.arrival.is_over(frame * self.step):
             return Bodies.none(), carry
         rng, time = self.draws(frame), frame * self.step
-        lower, size = np.asarray(self.domain.lower), np.asarray(self.domain.size)
         positions, diameters, share, carry = feed(self.sizes, self.domain, carry, self.step, rng)
-        fallen = self.settled(positions, fall_speed(diameters, self.effect.material), time)
-        positions = positions + fallen * (share * self.step)[:, None]
-        positions[:, :2] = lower[:2] + (positions[:, :2] - lower[:2]) % size[:2]
-        # Each came in at its own time within the step; a front is where it is in this frame.
-        came = time if self.arrival.is_front else time - share * self.step
-        comes = self.arrival.times(positions, self.draws(frame, SHOWN).uniform(size=len(positions))) <= came
-        fed = self.newborn(positions, diameters, fallen, rng).select(comes & self.sight.needed(positions))
-        # Within an onset fewer leave, and so fewer come in: these need no thinning of their own.
-        blown = self._around(gone, time)
-        return Bodies.join([fed, replace(blown, kinds=np.zeros_like(blown.kinds)), self.arriving(frame)]), carry
+        velocities = self.settled(positions, fall_speed(diameters, self.effect.material), time)
+        positions = positions + velocities * (share * self.step)[:, None]
+        self._wrap(positions)
+        # Each particle entered at its own time within the step. The position of a front is that of this frame.
+        entered = time if self.arrival.is_front else time - share * self.step
+        arrived = self.arrival.times(positions, self.draws(frame, SHOWN).uniform(size=len(positions))) <= entered
+        fed = self.newborn(positions, diameters, velocities, rng).select(arrived & self.sight.needed(positions))
+        # During an onset fewer particles leave, so fewer enter at the opposite side: these need no thinning of their own.
+        through_sides = self._wrapped(gone, time)
+        through_sides = replace(through_sides, kinds=np.zeros_like(through_sides.kinds))
+        return Bodies.join([fed, through_sides, self.arriving(frame)]), carry
 
-    def _risen(self, frame: int) -> Bodies:
-        """Those of the air's first particles that come in `frame`: as if they had been on their way for long, so none is below
-        a roof or under the ground.
+    def _reached(self, frame: int) -> Bodies:
+        """The particles of a full domain that the weather, which arrives everywhere, reaches in `frame`.
 
-        They follow from the seed alone and are drawn anew in each frame, so that nothing has to be kept for a run that goes on.
+        They are in a steady state, so none is below a roof or under the ground. They follow from the seed alone and are drawn
+        anew in each frame, so that an interrupted run needs no stored list of them.
         """
         rng, time = self.draws(0), frame * self.step
         positions, diameters = fill(self.sizes, self.domain, rng)
         new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
         times = self.arrival.times(positions, self.draws(0, ARRIVING).uniform(size=len(positions)))
-        comes = np.ceil(times / self.step).clip(1.0 if self.effect.timeline.starts_clear else 0.0) == frame
-        positions, speeds = positions[comes], fall_speed(diameters[comes], self.effect.material)
+        now = np.ceil(times / self.step).clip(1.0 if self.effect.timeline.starts_clear else 0.0) == frame
+        positions, speeds = positions[now], fall_speed(diameters[now], self.effect.material)
         velocities = self.settled(positions, speeds, time).astype(np.float32)
-        new = replace(new.select(comes), velocities=velocities)
+        new = replace(new.select(now), velocities=velocities)
         return new.select(~self.shadowed(positions, speeds, time) & self.sight.needed(positions))
 
-    def _overtaken(self, frame: int) -> Bodies:
-        """What was ahead of the front in the frame before and is behind it in `frame`, also around the sides of the box."""
+    def _passed_by_front(self, frame: int) -> Bodies:
+        """Particles ahead of the front in the frame before and behind it in `frame`, across the domain's sides too."""
         if frame == 0:
             return Bodies.none()
         rng, before = self.draws(frame, AHEAD), (frame - 1) * self.step
@@ -144,19 +179,24 @@ class Air:
         ahead = self.arrival.times(positions) > before
         positions, diameters = positions[ahead], diameters[ahead]
         new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
-        # Settled, by the kernel, which is many times faster than `settled`: what hardly falls has at once the air's velocity.
+        # Particles of almost no terminal speed take the air's velocity at once, so the kernel yields settled velocities; it is
+        # many times faster than `settled`.
         weightless, none = np.full(len(new), 1e-9, np.float32), Flutter.none(len(new))
         advance(new.positions.copy(), new.velocities, weightless, none, self.wind, before, self.step)
         new.velocities[:, 2] -= new.speeds
         self.fly(new, frame, WALK_AHEAD)
-        return self._around(new, frame * self.step)
+        return self._wrapped(new, frame * self.step)
 
-    def _around(self, bodies: Bodies, time: float) -> Bodies:
-        """Particles put where they are in a box that goes on at its opposite side; those that can be there, and are needed."""
-        lower, size = np.asarray(self.domain.lower), np.asarray(self.domain.size)
-        inside = (bodies.positions[:, 2] >= lower[2]) & (bodies.positions[:, 2] <= self.domain.upper[2])
+    def _wrapped(self, bodies: Bodies, time: float) -> Bodies:
+        """Particles wrapped into the domain, which is periodic in x and y, without those that cannot be there or are unneeded."""
+        inside = (bodies.positions[:, 2] >= self.domain.lower[2]) & (bodies.positions[:, 2] <= self.domain.upper[2])
         wrapped = bodies.positions.astype(np.float64)
-        wrapped[:, :2] = lower[:2] + (wrapped[:, :2] - lower[:2]) % size[:2]
+        self._wrap(wrapped)
         inside &= self.sight.needed(wrapped) & self.arrival.passed(wrapped, time)
         inside[inside] = ~self.shadowed(wrapped[inside], bodies.speeds[inside], time)
         return replace(bodies.select(inside), positions=wrapped[inside].astype(np.float32))
+
+    def _wrap(self, positions: Float[ndarray, "n 3"]) -> None:
+        """Wrap x and y into the domain, in place."""
+        lower, size = np.asarray(self.domain.lower[:2]), np.asarray(self.domain.size[:2])
+        positions[:, :2] = lower + (positions[:, :2] - lower) % size

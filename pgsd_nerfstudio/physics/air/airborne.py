@@ -1,11 +1,11 @@
-"""Particles that fall through air without touching each other.
+"""Flight of particles that fall through air without contact with each other.
 
-Linear drag about the terminal velocity: dv/dt = -(v - v_inf) / tau with tau = v_t / g, so a step through steady air is exact
-whatever its length. The wind is taken at the middle of the step, which makes changing air second order at the cost of first.
-Each flake also sways sideways on a small circle of its own (flutter), as its settled velocity does.
+Drag is linear about the terminal velocity: dv/dt = -(v - v_inf) / tau with tau = v_t / g, so a step through steady air is exact
+whatever its length. The wind is taken at the middle of the step, which makes the step second order in changing air at the cost
+of a first-order one. The settled velocity of each particle also turns on a small horizontal circle of its own (flutter).
 
-The kernel is generic: float32 at work, float64 in tests. `WindField.velocity` is the plain form of the wind within. Without
-obstacles the kernel is compiled for `None` in place of their arrays, so that open country does not pay for them.
+The kernel is generic: it runs in float32, and in float64 in tests. `WindField.velocity` is the plain form of its wind. In open
+country the kernel is compiled for `None` in place of the obstacles' arrays, so that obstacles cost nothing there.
 """
 
 from __future__ import annotations
@@ -28,30 +28,42 @@ _SINE = (6.283185160088967, -41.34165503128624, 81.60100406452872, -76.549782080
 
 @dataclass(frozen=True)
 class Flutter:
-    """The swaying of n particles."""
+    """Flutter of n particles."""
 
     speed: Float[ndarray, " n"]
     """m/s."""
     hertz: Float[ndarray, " n"]
+    """Turns per second; the sign is the sense of rotation."""
     phase: Float[ndarray, " n"]
     """Turns."""
 
     @staticmethod
     def none(count: int, dtype: type = np.float32) -> Flutter:
+        """No flutter for `count` particles."""
         zero = np.zeros(count, dtype)
         return Flutter(zero, zero, zero)
 
 
 def advance(
-    position: Float[ndarray, "n 3"],  # m, z up; changed in place
-    velocity: Float[ndarray, "n 3"],  # m/s; changed in place
-    speed: Float[ndarray, " n"],  # terminal, m/s
+    position: Float[ndarray, "n 3"],
+    velocity: Float[ndarray, "n 3"],
+    speed: Float[ndarray, " n"],
     flutter: Flutter,
     wind: WindField,
-    time: float,  # s, at the start of the step
-    step: float,  # s
+    time: float,
+    step: float,
 ) -> None:
-    """Advance all particles by `step` seconds."""
+    """Advance all particles by one step.
+
+    Args:
+        position: m, z up; changed in place.
+        velocity: m/s; changed in place.
+        speed: terminal speeds, m/s.
+        flutter: of the particles.
+        wind: the moving air.
+        time: s, at the start of the step.
+        step: s.
+    """
     number = position.dtype.type
     middle = time + 0.5 * step
     mean = wind.at_reference(middle)
@@ -76,7 +88,7 @@ def advance(
 
 
 def _obstacles(wind: WindField, mean: Float[ndarray, "2"], dtype: np.dtype) -> tuple[ndarray | None, ...]:
-    """Lattice and nodes of the deflection for the kernel; None where the country is open."""
+    """Lattice and nodes of the deflection for the kernel; None in open country."""
     if wind.deflection is None:
         return None, None, None, None
     nodes, ramp, calmed = wind.deflection.nodes(mean, dtype)
@@ -95,7 +107,7 @@ def _cosine(turns, half, quarter, c):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _node(place, last, zero):
-    """First of the three nodes around a place, and the share of the way to the second; NaN is put on the first of all."""
+    """First of the three nodes around a place, and the fraction of the distance to the second; NaN goes to node 0."""
     place = place if place > zero else zero
     place = place if place < last else last
     floor = np.floor(place)
@@ -103,8 +115,8 @@ def _node(place, last, zero):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _around(nodes, i, j, k, x, y, z, half, one):
-    """What obstacles change in the mean wind: each component quadratic along its own axis, linear along the others."""
+def _deflected(nodes, i, j, k, x, y, z, half, one):
+    """Change of the mean wind by obstacles: each component is quadratic along its own axis and linear along the others."""
     lx, ly, lz = (one - x, x), (one - y, y), (one - z, z)
     qx = (half * lx[0] * lx[0], half + x * lx[0], half * x * x)
     qy = (half * ly[0] * ly[0], half + y * ly[0], half * y * y)
@@ -123,7 +135,7 @@ def _around(nodes, i, j, k, x, y, z, half, one):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _shelter(ramp, i, j, k, x, y, z, half, one):
-    """How much turbulence obstacles leave, and the gradient of that per node: smooth steps between eight nodes."""
+    """Share of the turbulence that obstacles leave, and its gradient per node: smooth steps between eight nodes."""
     three, six = (one + half) / half, (one + one + one) / half
     step_x, step_y, step_z = x * x * (three - x - x), y * y * (three - y - y), z * z * (three - z - z)
     slope_x, slope_y, slope_z = six * x * (one - x), six * y * (one - y), six * z * (one - z)
@@ -174,21 +186,21 @@ def _advance(position, velocity, speed, sway, hertz, phase, modes, constants, c,
             i_x, share_x = _node((x - first_x) * inverse, last_x, zero)
             i_y, share_y = _node((y - first_y) * inverse, last_y, zero)
             i_z, share_z = _node((height - first_z) * inverse, last_z, zero)
-            around_x, around_y, around_z = _around(nodes, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
+            change_x, change_y, change_z = _deflected(nodes, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
             if calmed[i_x, i_y, i_z]:
                 shelter, rise_x, rise_y, rise_z = _shelter(ramp, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
-                around_x += inverse * calm * (rise_y * lifted_z + rise_z * lifted_x)
-                around_y += inverse * calm * (rise_z * lifted_y - rise_x * lifted_z)
-                around_z -= inverse * calm * (rise_x * lifted_x + rise_y * lifted_y)
+                change_x += inverse * calm * (rise_y * lifted_z + rise_z * lifted_x)
+                change_y += inverse * calm * (rise_z * lifted_y - rise_x * lifted_z)
+                change_z -= inverse * calm * (rise_x * lifted_x + rise_y * lifted_y)
                 calm, slope = calm * shelter, slope * shelter
         settled_x = calm * swirl_x + slope * lifted_x + profile * mean_x + sway[i] * _cosine(turns, half, quarter, c)
         settled_y = calm * swirl_y + slope * lifted_y + profile * mean_y + sway[i] * _cosine(turns - quarter, half, quarter, c)
         settled_z = calm * swirl_z - speed[i]
         if nodes is not None:
-            settled_x += around_x
-            settled_y += around_y
-            settled_z += around_z
-        # Relaxation time; particles that hardly fall (fog) follow the wind at once instead of dividing by zero.
+            settled_x += change_x
+            settled_y += change_y
+            settled_z += change_z
+        # Relaxation time, bounded from below: particles of almost no terminal speed (fog) follow the wind at once.
         tau = max(speed[i] / gravity, least)
         decay = np.exp(-step / tau)
         reach = tau * (one - decay)

@@ -1,8 +1,8 @@
-"""When a weather reaches a place: at once, everywhere by and by, or behind a front that the wind carries across the scene.
+"""When the weather reaches a place: at once, gradually everywhere, or behind a front that moves across the scene with the wind.
 
-A front is a vertical plane square to the mean wind. It stands in the domain's upwind corner at time 0 and moves evenly, so that
-it has passed the downwind corner at the onset: the arrival time of a place is linear in its coordinate along the wind. How fast
-the front goes thus follows from the onset, not from the wind; where both differ, see `air`.
+A front is a vertical plane square to the mean wind. It is in the domain's upwind corner at time 0, moves evenly, and reaches
+the downwind corner at the onset: the arrival time of a place is linear in its coordinate along the wind. The speed of the front
+therefore follows from the onset and not from the wind; `air` deals with the difference.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from pgsd_nerfstudio.effects.effect import Wind
 from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.physics.clock import Domain
 
-INSTANT = 1e-9  # s; two times that differ by less are one
+INSTANT = 1e-9  # s; two times that differ by less are the same
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """The course of a timeline over a box of air."""
+    """Arrival times of a timeline in a domain."""
 
     timeline: Timeline
     along: Float[ndarray, "2"]
@@ -31,11 +31,11 @@ class Arrival:
     upwind: float
     """Coordinate along the wind of the domain's upwind corner, m."""
     spans: Float[ndarray, "2"]
-    """How far the domain's sides along x and y reach along the wind, m; together from its upwind to its downwind corner."""
+    """Extents of the domain's sides along x and y, measured along the wind, m. Their sum is the way from corner to corner."""
 
     @staticmethod
     def of(timeline: Timeline, domain: Domain, wind: Wind) -> Arrival:
-        """The course of that timeline in that box, with a front square to the mean wind."""
+        """The arrival times of a timeline in a domain, with a front square to the mean wind."""
         angle = math.radians(wind.direction_degrees)
         along = np.array([math.cos(angle), math.sin(angle)])
         lower, upper = np.asarray(domain.lower[:2]), np.asarray(domain.upper[:2])
@@ -44,13 +44,14 @@ class Arrival:
 
     @property
     def is_front(self) -> bool:
-        """Whether the weather comes behind a front, rather than everywhere alike."""
+        """Whether the weather arrives behind a front rather than everywhere."""
         return self.timeline.arrives == "as a front" and self.timeline.starts_clear
 
     def front_position(self, seconds: float) -> float:
-        """Coordinate along the wind, in metres, that the front is at; also before it has come in and after it has passed.
+        """Coordinate of the front along the wind in metres, also outside of the domain; infinite without an onset.
 
-        Infinite without an onset, where all is behind it.
+        Args:
+            seconds: time since the start of the run.
 
         Raises:
             ValueError: this weather arrives everywhere.
@@ -63,12 +64,15 @@ class Arrival:
 
     def times(
         self,
-        points: Float[ndarray, "n 3"],  # m
-        draws: Float[ndarray, " n"] | None = None,  # 0..1
+        points: Float[ndarray, "n 3"],
+        draws: Float[ndarray, " n"] | None = None,
     ) -> Float[ndarray, " n"]:
-        """Seconds at which the weather is at each point; zeros without an onset.
+        """Arrival time of the weather at each point in seconds; zeros without an onset.
 
-        draws: what arrives everywhere comes to a point at that share of the onset; a front does not need them.
+        Args:
+            points: m.
+            draws: numbers from 0..1. Weather that arrives everywhere reaches a point at that fraction of the onset; a front
+                does not need them.
 
         Raises:
             ValueError: the weather arrives everywhere within an onset, and there are no draws.
@@ -82,16 +86,25 @@ class Arrival:
         return self.timeline.onset * np.asarray(draws, np.float64)
 
     def passed(self, points: Float[ndarray, "n 3"], seconds: float) -> Bool[ndarray, " n"]:
-        """Which points no front is still to come to; all, where the weather arrives everywhere."""
+        """Which points a front has reached; all points where the weather arrives everywhere.
+
+        Args:
+            points: m.
+            seconds: time since the start of the run.
+        """
         if not self.is_front or seconds >= self.timeline.onset:
             return np.ones(len(points), bool)
         return self.times(points) <= seconds
 
     def share(self, seconds: float) -> float:
-        """How much of the weather is in the box by then, 0..1; of a front: the share of the plan that is behind it."""
+        """Share of the weather that is in the domain, 0..1; with a front it is the share of the plan behind the front.
+
+        Args:
+            seconds: time since the start of the run.
+        """
         if not self.is_front:
             return self.timeline.share(seconds)
-        # The plan reaches as far along the wind as the sum of two even draws: its area behind a front is their distribution.
+        # Along the wind the plan's points are distributed as the sum of two uniform draws, with this distribution function.
         behind, (short, long) = float(self.spans.sum()) * self.timeline.share(seconds), np.sort(self.spans)
         if short < 1e-9 * long:
             return min(behind / float(long), 1.0)
@@ -99,5 +112,5 @@ class Arrival:
         return float((corners @ [1.0, -1.0, -1.0, 1.0]) / (2 * short * long))
 
     def is_over(self, seconds: float) -> bool:
-        """Whether nothing new comes any more."""
+        """Whether no more particles enter after `seconds`."""
         return seconds > self.timeline.ends + INSTANT

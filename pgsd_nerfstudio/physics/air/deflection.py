@@ -1,19 +1,19 @@
-"""Wind that goes around obstacles: a mass-consistent flow on a coarse lattice.
+"""Deflection of the wind by obstacles: a mass-consistent flow on a coarse lattice.
 
-Of all flows that carry no divergence and pass through no obstacle, the one nearest to the undisturbed wind u0 (Sherman, "A
+It is the flow nearest to the undisturbed wind u0 that has no divergence and passes through no obstacle (Sherman, "A
 mass-consistent model for wind fields over complex terrain", 1978; QUIC-URB and WindNinja solve the same): u = u0 + grad lambda,
-div u = 0, u . n = 0 on what is blocked and on the ground at z = 0, lambda = 0 on the sides and the top of the box. It is linear
-in u0, so two solutions, for 1 m/s along x and along y, make every gust. There is no wake in it: the air is slowed before and
-behind a wall alike, and it is quick above and beside.
+div u = 0, u . n = 0 on blocked faces and on the ground at z = 0, lambda = 0 on the sides and the top of the lattice. The flow
+is linear in u0, so two solutions, for 1 m/s along x and along y, combine into every gust. The flow has no wake: the air is
+equally slow before and behind a wall, and it is fast above and beside it.
 
 A lattice face is blocked where the mesh cuts the line between the two cell centres: thin walls stop the air, closed bodies are
-tight, and no inside has to be known. Cells with no way out hold still air.
+tight, and no inside has to be known. Cells that are closed off hold still air.
 
-What is kept is the difference to u0, as splines: each component quadratic along its own axis, linear along the others. The
-slope of a quadratic B-spline is the difference of two linear ones, so the divergence between the lattice points is the linear
-interpolation of that of the cells: none anywhere in the domain. Interpolating velocities at cell centres linearly would leave
-some in every cell, and snow would thin out and gather there. The price: right at a wall a share of the normal wind one cell
-away (an eighth) remains; the surface itself stops what flies.
+The difference to u0 is stored as splines: each component is quadratic along its own axis and linear along the others. The slope
+of a quadratic B-spline is the difference of two linear ones, so the divergence between the nodes is the linear interpolation of
+the divergence of the cells: zero anywhere in the domain. Linear interpolation of velocities at cell centres would leave some
+divergence in every cell, and snow would thin out and gather there. The drawback is that an eighth of the normal wind one cell
+away remains right at a wall; the surface itself stops particles.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.boundary_layer import CALM, law_of_the_wall
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
 
-CELL = 0.35  # m; smaller only where a side of the domain would have fewer than FEWEST cells
+CELL = 0.35  # m; smaller only where a side of the domain would otherwise have fewer than FEWEST cells
 FEWEST = 4
 MOST = 60_000  # cells; larger domains get larger cells
 RESIDUAL = 1e-9  # of the divergence, m/s per cell
-OVERLAP = 1e-4  # cells by which lines reach beyond a centre, so that a wall through centres is not missed by both sides
-PAD = 2  # nodes around the cells on which splines fade out
+OVERLAP = 1e-4  # cells; lines reach that far beyond a centre, so that a wall through centres is not missed on both sides
+PAD = 2  # nodes around the cells, on which splines fade out
 BOTTOM = 0.75  # thickness of the lowest layer in cells, see `_splines`
 
 Faces = tuple[ndarray, ndarray, ndarray]
-"""Something on every face across x, y and z: shapes [..., x+1, y, z], [..., x, y+1, z], [..., x, y, z+1]."""
+"""A value on every face across x, y and z: shapes [..., x+1, y, z], [..., x, y+1, z], [..., x, y, z+1]."""
 
 
 class Lattice(NamedTuple):
-    """Cubic cells around a domain, one more than it needs on each side and above."""
+    """Cubic cells that cover a domain, with one more cell on each side and above."""
 
     lower: Float[ndarray, "3"]
     """Corner of the first cell, m."""
@@ -61,11 +61,15 @@ class Lattice(NamedTuple):
     """Edge, m."""
     shape: tuple[int, int, int]
     grounded: bool
-    """Whether the lowest faces are the ground; else air passes below."""
+    """Whether the lowest faces are the ground; otherwise air passes through them."""
 
     @staticmethod
     def around(domain: Domain) -> Lattice:
-        """Raises ValueError where the domain is not finite."""
+        """The lattice of a domain.
+
+        Raises:
+            ValueError: the domain is not finite.
+        """
         lower, upper = np.array(domain.lower), np.array(domain.upper)
         if not np.isfinite([lower, upper]).all():
             raise ValueError(f"wind can be deflected in a finite domain only, got {domain.lower} to {domain.upper} m")
@@ -86,35 +90,40 @@ class Lattice(NamedTuple):
 
     @property
     def heights(self) -> Float[ndarray, " z"]:
-        """Of the middle of each layer, m."""
+        """Height of the middle of each layer, m."""
         return self.lower[2] + self.cell * (np.arange(self.shape[2]) + 0.5)
 
     @property
     def thickness(self) -> Float[ndarray, " z"]:
-        """Of each layer, in cells."""
+        """Thickness of each layer, in cells."""
         return np.where((np.arange(self.shape[2]) == 0) & self.grounded, BOTTOM, 1.0)
 
     def face_centres(self, axis: int) -> Float[ndarray, "x y z 3"]:
-        """Middle of every face across an axis, m."""
+        """Middle of every face across an axis (0, 1 or 2), m."""
         middle = [np.arange(n + (a == axis)) + 0.5 * (a != axis) for a, n in enumerate(self.shape)]
         return self.lower + self.cell * np.stack(np.meshgrid(*middle, indexing="ij"), -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """What obstacles change in the wind of a domain; nothing beyond a cell and a half outside the lattice."""
+    """Change of the wind of a domain by obstacles; it is zero farther than a cell and a half outside of the lattice."""
 
     lattice: Lattice
     fluxes: Faces
     """Wind through every face, [2, ...] m/s for 1 m/s along x and along y at the reference height."""
     splines: Float[ndarray, "2 i j k 3"]
-    """Coefficients of the difference to the undisturbed wind; node [i, j, k] holds the lower faces of cell [i, j, k] - PAD."""
+    """Coefficients of the difference to the undisturbed wind; node [i, j, k] has the lower faces of cell [i, j, k] - PAD."""
     ramp: Float[ndarray, "i j k"]
-    """How much turbulence is left at cell centres, 0 beside obstacles and 1 in free air; nodes as above."""
+    """Share of the turbulence that is left at cell centres, 0 beside obstacles and 1 in free air; nodes as above."""
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, wind: Wind) -> Deflection | None:
-        """How a surface deflects a wind in a domain; None where nothing stands in the way.
+        """Deflection of a wind by a surface; None where the surface blocks no face.
+
+        Args:
+            surface: the obstacles, in metres.
+            domain: the simulated air.
+            wind: its roughness and reference height; its speed and direction do not matter.
 
         Raises:
             ValueError: the domain is not finite.
@@ -132,12 +141,26 @@ class Deflection:
 
     @staticmethod
     def around(lattice: Lattice, passable: Faces, profile: Float[ndarray, " z"]) -> Deflection:
-        """The flow past given blocked faces, of a wind with a given speed in each layer (m/s)."""
+        """Deflection of a wind by given faces.
+
+        Args:
+            lattice: the cells.
+            passable: whether air can pass each face.
+            profile: undisturbed wind in each layer, m/s.
+
+        Raises:
+            RuntimeError: the flow could not be solved.
+        """
         fluxes, passable = mass_consistent(passable, profile, lattice.thickness)
         return Deflection(lattice, fluxes, _splines(lattice, fluxes, profile), _ramp(lattice, passable))
 
     def velocity(self, points: Float[ndarray, "n 3"], wind: Float[ndarray, "2"]) -> Float[ndarray, "n 3"]:
-        """Difference to the undisturbed wind in m/s, where that is `wind` at the reference height."""
+        """Difference to the undisturbed wind in m/s.
+
+        Args:
+            points: m.
+            wind: undisturbed wind along x and y at the reference height, m/s.
+        """
         base, share = self._at(points)
         linear = np.stack([1 - share, share])
         square = np.stack([(1 - share) ** 2 / 2, 0.5 + share - share**2, share**2 / 2])
@@ -145,11 +168,11 @@ class Deflection:
         for axis in range(3):
             x, y, z = ((square if a == axis else linear)[..., a] for a in range(3))
             found = self.splines[(slice(None), *_block(base, (len(x), len(y), len(z))), axis)]
-            velocity[:, axis] = _mixed(wind[0] * found[0] + wind[1] * found[1], x, y, z)
+            velocity[:, axis] = _weighted(wind[0] * found[0] + wind[1] * found[1], x, y, z)
         return velocity
 
     def shelter(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
-        """How much turbulence is left, 0-1, and the gradient of that in 1/m, which is continuous."""
+        """Share of the turbulence that is left, 0-1, and its gradient in 1/m, which is continuous, at points in metres."""
         base, share = self._at(points)
         smooth, slope = share**2 * (3 - 2 * share), 6 * share * (1 - share) / self.lattice.cell
         weights, slopes = np.stack([1 - smooth, smooth]), np.stack([-slope, slope])
@@ -157,13 +180,13 @@ class Deflection:
         gradient = np.empty((len(points), 3))
         for axis in range(3):
             x, y, z = ((slopes if a == axis else weights)[..., a] for a in range(3))
-            gradient[:, axis] = _mixed(found, x, y, z)
-        return _mixed(found, *np.moveaxis(weights, 2, 0)), gradient
+            gradient[:, axis] = _weighted(found, x, y, z)
+        return _weighted(found, *np.moveaxis(weights, 2, 0)), gradient
 
     def _at(self, points: Float[ndarray, "n 3"]) -> tuple[Int[ndarray, "n 3"], Float[ndarray, "n 3"]]:
-        """First node of the 27 around each point, and where the point lies after it, 0-1. The last nodes are empty."""
+        """First of the 27 nodes around each point, and the fraction of the distance to the next. The last nodes are empty."""
         raised = np.column_stack([points[:, :2], points[:, 2].clip(0.0)])
-        place = np.fmax((raised - self.first) / self.lattice.cell, 0.0)  # NaN is put on the first node
+        place = np.fmax((raised - self.first) / self.lattice.cell, 0.0)  # NaN goes to the first node
         place = np.minimum(place, np.array(self.ramp.shape) - 3.0)
         base = np.floor(place).astype(int)
         return base, place - base
@@ -179,7 +202,16 @@ class Deflection:
         return self.lattice.cell
 
     def nodes(self, wind: Float[ndarray, "2"], dtype: DTypeLike) -> tuple[ndarray, ndarray, ndarray]:
-        """For the kernel of `airborne`: splines for one wind [i, j, k, 3], ramp, and after which nodes it is not 1."""
+        """Arrays for the kernel of `airborne`.
+
+        Args:
+            wind: undisturbed wind along x and y at the reference height, m/s.
+            dtype: of the first two arrays, float32 or float64.
+
+        Returns:
+            Spline coefficients for that wind [i, j, k, 3], the ramp [i, j, k], and whether the ramp is below 1 at any of the
+            eight nodes from each node on [i, j, k].
+        """
         splines, ramp, calmed = self._single if dtype == np.float32 else (self.splines, self.ramp, self._calmed)
         nodes = splines[0] * splines.dtype.type(wind[0])
         nodes += splines[1] * splines.dtype.type(wind[1])
@@ -195,27 +227,27 @@ class Deflection:
 
 
 def _block(base: Int[ndarray, "n 3"], size: tuple[int, int, int]) -> tuple[ndarray, ndarray, ndarray]:
-    """Indices of the nodes from `base` on, that many along each axis, for arrays [i, j, k]; they make [n, *size]."""
+    """Indices into arrays [i, j, k] of the `size` nodes from each `base` on; they select an array [n, *size]."""
     x, y, z = (base[:, axis, None] + np.arange(size[axis]) for axis in range(3))
     return x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]
 
 
-def _mixed(
+def _weighted(
     found: Float[ndarray, "n a b c"], x: Float[ndarray, "a n"], y: Float[ndarray, "b n"], z: Float[ndarray, "c n"]
 ) -> Float[ndarray, " n"]:
-    """Nodes around each point weighted along each axis."""
+    """Sums over the nodes around each point, weighted along each axis."""
     columns = (found * z.T[:, None, None]).sum(3)
     return ((columns * y.T[:, None]).sum(2) * x.T).sum(1)
 
 
 def open_faces(surface: SurfaceMesh, lattice: Lattice) -> Faces:
-    """Faces through which air can pass: no triangle cuts the line between the two cell centres, and it is not the ground."""
+    """Whether air can pass each face: no triangle cuts the line between the cell centres, and the face is not the ground."""
     found = []
     for axis in range(3):
         step = lattice.cell * np.eye(3)[axis]
         start = lattice.face_centres(axis) - step / 2
         rays = torch.from_numpy(start.reshape(-1, 3)).float()
-        # Of `SurfaceMesh.cast` only the distance is wanted; the normals of so many hits would take a hundred times as long.
+        # Only distances are needed; `SurfaceMesh.cast` also computes normals, which would take a hundred times as long.
         hits = surface.raycasting.cast_rays(queries(rays, torch.from_numpy(step).float().expand_as(rays)))
         found.append(hits["t_hit"].numpy().reshape(start.shape[:3]) > 1 + OVERLAP)
     if lattice.grounded:
@@ -224,17 +256,22 @@ def open_faces(surface: SurfaceMesh, lattice: Lattice) -> Faces:
 
 
 def mass_consistent(passable: Faces, profile: Float[ndarray, " z"], thickness: Float[ndarray, " z"]) -> tuple[Faces, Faces]:
-    """Flow without divergence nearest to winds along x and along y with the speeds `profile` (m/s) in layers of `thickness`.
+    """The flows without divergence that are nearest to undisturbed winds along x and along y.
+
+    Args:
+        passable: whether air can pass each face.
+        profile: undisturbed wind in each layer, m/s.
+        thickness: of each layer, in cells.
 
     Returns:
-        The wind through every face, [2, ...] m/s, and which faces it passes: cells without a way out are closed off.
+        The wind through every face, [2, ...] m/s, and the faces that it passes; faces of closed-off cells are not among them.
 
     Raises:
         RuntimeError: the conjugate gradients did not converge.
     """
     shape = passable[0].shape[0] - 1, passable[1].shape[1] - 1, passable[2].shape[2] - 1
-    count = math.prod(shape)  # also the number of the one cell that stands for all outside
-    first, second = _sides(shape)
+    count = math.prod(shape)  # also the index of the one cell that represents all of the outside
+    first, second = _cells_beside(shape)
     free = _flat(passable)
     joins = sparse.coo_array((np.ones(free.sum()), (first[free], second[free])), (count + 1, count + 1))
     labels = connected_components(joins, directed=False)[1]
@@ -259,8 +296,8 @@ def mass_consistent(passable: Faces, profile: Float[ndarray, " z"], thickness: F
     return _faces(fluxes, passable), _faces(free, passable)
 
 
-def _sides(shape: tuple[int, int, int]) -> tuple[Int[ndarray, " f"], Int[ndarray, " f"]]:
-    """Numbers of the cells before and after every face; beyond the lattice is one more cell."""
+def _cells_beside(shape: tuple[int, int, int]) -> tuple[Int[ndarray, " f"], Int[ndarray, " f"]]:
+    """Indices of the cells before and after every face; one more cell represents all of the outside."""
     count = math.prod(shape)
     cells = np.arange(count).reshape(shape)
     padded = [np.pad(cells, [(int(a == axis),) * 2 for a in range(3)], constant_values=count) for axis in range(3)]
@@ -269,7 +306,7 @@ def _sides(shape: tuple[int, int, int]) -> tuple[Int[ndarray, " f"], Int[ndarray
 
 
 def _undisturbed(shape: tuple[int, int, int], profile: Float[ndarray, " z"]) -> Faces:
-    """Winds along x and along y with the same speed everywhere in a layer, [2, ...]."""
+    """Winds along x and along y that are uniform within each layer, [2, ...]."""
     x, y, z = (np.zeros((2, *(n + (a == axis) for a, n in enumerate(shape)))) for axis in range(3))
     x[0], y[1] = profile, profile
     return x, y, z
@@ -288,9 +325,9 @@ def _faces(flat: Float[ndarray, "... f"], like: Faces) -> Faces:
 def _splines(lattice: Lattice, fluxes: Faces, profile: Float[ndarray, " z"]) -> Float[ndarray, "2 i j k 3"]:
     """Coefficients of the difference to the undisturbed wind.
 
-    On the ground the difference is to vanish: horizontal wind is reflected with the other sign, so that the hat of the lowest
-    layer falls from its middle to 0 on the ground, and what rises is as in the layer above times (z / cell)^2 4/3. That hat
-    contains 3/4 of a cell, which is why the lowest layer counts as that thick.
+    The difference vanishes on the ground. Horizontal components are reflected there with the opposite sign, so that the hat
+    function of the lowest layer falls from its middle to 0 on the ground; the vertical component is that of the layer above
+    times (z / cell)^2 4/3. The hat function has the area of 3/4 of a cell, which is why the lowest layer counts as that thick.
     """
     nodes = np.zeros((2, *(n + 2 * PAD + 2 for n in lattice.shape), 3))
     for axis, (wind, before) in enumerate(zip(fluxes, _undisturbed(lattice.shape, profile), strict=True)):
@@ -304,10 +341,10 @@ def _splines(lattice: Lattice, fluxes: Faces, profile: Float[ndarray, " z"]) -> 
 
 
 def _ramp(lattice: Lattice, passable: Faces) -> Float[ndarray, "i j k"]:
-    """Share of the turbulence at cell centres: 0 half a cell from what is blocked, 1 another CALM away (Bridson's ramp)."""
+    """Share of the turbulence at cell centres: 0 half a cell from blocked faces, 1 another CALM away (ramp of Bridson 2007)."""
     walls = [lattice.face_centres(axis)[~faces] for axis, faces in enumerate(passable)]
     if lattice.grounded:
-        walls[2] = walls[2][walls[2][:, 2] > 0]  # the ground calms the air by itself
+        walls[2] = walls[2][walls[2][:, 2] > 0]  # `calming` already accounts for the ground
     lower, upper = lattice.face_centres(0)[:-1], lattice.face_centres(0)[1:]
     distance, _ = KDTree(np.concatenate(walls)).query((lower + upper) / 2)
     share = ((distance - lattice.cell / 2) / CALM).clip(0.0, 1.0)

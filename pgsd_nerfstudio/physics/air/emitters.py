@@ -1,11 +1,12 @@
-"""What comes into the box of air: which sizes, how many, where.
+"""Particles that enter the domain: their sizes, numbers and positions.
 
-Steady weather is the same everywhere in the air: number density N(D) in the volume, flux N(D) v(D) through the top. So the
-box starts full (or fills when the weather comes, see `air`), is fed at the top, and what the wind blows out at one side comes
-in at the opposite side as a new particle: no wedge stays empty, and nothing is simulated outside of the box.
+Steady weather is the same everywhere in the air: number density N(D) in the volume, flux N(D) v(D) through the top. The domain
+therefore starts full (or fills when the weather arrives, see `air`), and particles enter through the top. A particle that the
+wind carries out at one side enters at the opposite side as a new particle: no wedge stays empty, and nothing is simulated
+outside of the domain.
 
 There are far more real particles than can be simulated or seen. A real particle is simulated with a chance that grows with its
-diameter, and then represents 1 / chance of its kind: counts are thinned, water is not.
+diameter, and then represents 1 / chance real particles: counts are thinned, the mass of water is not.
 """
 
 from __future__ import annotations
@@ -23,24 +24,29 @@ from pgsd_nerfstudio.physics.laws.populations import cumulative, fall_speed, int
 
 @dataclass(frozen=True)
 class Sizes:
-    """Tabulated spectrum of what is simulated, over the diameter."""
+    """Tabulated spectrum of the simulated particles over their diameter."""
 
     diameters: Float[ndarray, " d"]
     """Metres, ascending."""
     chances: Float[ndarray, " d"]
-    """Chance of a real particle of that size to be simulated."""
+    """Chance of a real particle of each diameter to be simulated."""
     in_air: Float[ndarray, " d"]
-    """Simulated particles in 1 m^3 with at most that diameter."""
+    """Simulated particles per m^3 with at most each diameter."""
     through_top: Float[ndarray, " d"]
-    """Simulated particles through 1 m^2 in 1 s with at most that diameter."""
+    """Simulated particles per m^2 and second with at most each diameter."""
     real_in_air: float
-    """Real particles of the simulated range of sizes in 1 m^3."""
+    """Real particles per m^3 in the simulated range of sizes."""
 
     @staticmethod
     def of(effect: Effect, volume: float, max_particles: int) -> Sizes:
-        """The spectrum of an effect, thinned so that about `max_particles` are in `volume` m^3 of air at once.
+        """The spectrum of an effect, thinned to a number of particles.
 
-        All of what is asked for is carried by the simulated range of sizes.
+        The simulated range of sizes carries all of the emission's water or extinction.
+
+        Args:
+            effect: its emission and material.
+            volume: of the domain, m^3.
+            max_particles: about the most particles in that volume at once.
         """
         emission, material = effect.emission, effect.material
         diameter = np.geomspace(emission.smallest, emission.largest, 1024)
@@ -65,17 +71,23 @@ class Sizes:
         )
 
     def draw(self, cumulative: Float[ndarray, " d"], count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
-        """`count` diameters of that spectrum, one from each of `count` equal parts of it, in random order."""
+        """Random diameters in metres, one from each of `count` equal parts of a spectrum, in random order.
+
+        Args:
+            cumulative: `in_air` or `through_top`.
+            count: number of diameters.
+            rng: source of the draws.
+        """
         share = (rng.permutation(count) + rng.uniform(size=count)) / max(count, 1)
         return np.interp(share * cumulative[-1], cumulative, self.diameters)
 
     def represents(self, diameters: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-        """How many real particles one simulated particle of that size stands for."""
+        """Real particles that one simulated particle of each diameter (m) represents."""
         return 1.0 / np.interp(diameters, self.diameters, self.chances)
 
 
 def fill(sizes: Sizes, domain: Domain, rng: np.random.Generator) -> tuple[Float[ndarray, "n 3"], Float[ndarray, " n"]]:
-    """Positions and diameters of what is in the air at the start: evenly spread over the box."""
+    """Positions and diameters in metres of the particles that fill the domain evenly."""
     count = round(sizes.in_air[-1] * domain.volume)
     positions = np.asarray(domain.lower) + rng.uniform(size=(count, 3)) * np.asarray(domain.size)
     return positions, sizes.draw(sizes.in_air, count, rng)
@@ -84,10 +96,18 @@ def fill(sizes: Sizes, domain: Domain, rng: np.random.Generator) -> tuple[Float[
 def feed(
     sizes: Sizes, domain: Domain, carry: float, step: float, rng: np.random.Generator
 ) -> tuple[Float[ndarray, "n 3"], Float[ndarray, " n"], Float[ndarray, " n"], float]:
-    """What comes in through the top within one step of `step` seconds.
+    """Particles that enter through the top within one step.
 
-    Returns positions at the top, diameters, the share of the step that each has been inside for, and the fraction of a particle
-    to carry over to the next step.
+    Args:
+        sizes: spectrum of the particles.
+        domain: the air that they enter.
+        carry: fraction of a particle that is due from the step before.
+        step: s.
+        rng: source of the draws.
+
+    Returns:
+        Positions at the top in metres, diameters in metres, the fraction of the step for which each particle has been inside,
+        and the fraction of a particle to carry over to the next step.
     """
     due = sizes.through_top[-1] * domain.area * step + carry
     count = int(due)

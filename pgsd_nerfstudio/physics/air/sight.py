@@ -1,23 +1,25 @@
-"""Which air matters: where cameras see particles, and from where particles can still come into sight.
+"""The region of sight: the air where cameras see particles, and the air from which particles may still come into view.
 
-Cells of the domain's box are seen if any part of them may lie in a camera's pyramid of view. From a cell a particle can come
-into sight if some displacement to a seen cell is possible. How far it may have moved after t seconds:
+A cell of the domain is seen if any part of it may be in a camera's pyramid of view. A cell is needed if some displacement from
+it to a seen cell is possible. The bounds of the displacement after t seconds are:
 
-- down between slowest t - r(t) and fastest t + r(t), the range of settled speeds;
-- along the mean wind between -G(t) - r(t) and full t + G(t) + r(t), as that wind is anything from none (near the ground, in
-  the lee of things) to `full`, the one at the top of the box; across it G(t) / 2 + r(t) to either side;
-- G: DEVIATIONS of what gusts add to that. A sine of frequency f and variance 1 in the wind moves air no farther than
-  min(t, 1 / (pi f)) in the mean square, and `wind` draws f evenly in log f between the ends of GUST_RATES / gust_seconds.
-  Where the wind grows with height a falling particle does not feel more (second mean value theorem);
-- r: DEVIATIONS of a walk with the rms and the eddy time T = (largest eddy) / (2 pi (rms + slowest / 4)) of the turbulence,
-  variance 2 rms^2 T (t - T (1 - exp(-t / T))) (Taylor, "Diffusion by continuous movements", 1922: straight at first, then
-  diffusion). The quarter was fitted to the walks of falling particles: eddies that lie along their way are passed slowly.
-  Then comes the diffusivity, and sideways the widest circle of the flutter.
+- Down, it is between slowest t - r(t) and fastest t + r(t), from the range of terminal speeds.
+- Along the mean wind, it is between -G(t) - r(t) and full t + G(t) + r(t). The mean wind is anything from 0 (near the ground,
+  in the lee of obstacles) to `full`, the wind at the top of the domain. Across the wind it is G(t) / 2 + r(t) to either side.
+- G bounds the gusts by DEVIATIONS standard deviations. A sine of frequency f and variance 1 in the wind moves air no farther
+  than min(t, 1 / (pi f)) in the mean square, and `wind` draws f evenly in log f between the ends of GUST_RATES / gust_seconds.
+  The growth of the wind with height adds nothing for a falling particle (second mean value theorem).
+- r bounds a random walk by DEVIATIONS standard deviations. The walk has the rms and the eddy time T = (largest eddy) / (2 pi
+  (rms + slowest / 4)) of the turbulence and the variance 2 rms^2 T (t - T (1 - exp(-t / T))) (Taylor, "Diffusion by continuous
+  movements", 1922: straight at first, then diffusion). The quarter was fitted to the walks of falling particles, which pass
+  slowly through eddies along their path. The diffusivity adds to the variance, and the widest circle of the flutter to the
+  horizontal bounds.
 
-Inertia adds nothing, as velocities under drag are means of settled velocities of the past.
+Inertia adds nothing, since velocities under drag are means of past settled velocities.
 
-The box is periodic in x and y: what leaves at one side comes in at the opposite side. Possible displacements thus make one
-pattern on a torus, the same for all cells, and needed = seen convolved with that pattern: one Fourier transform.
+The domain is periodic in x and y: a particle that leaves at one side enters at the opposite side. Possible displacements
+therefore form one pattern on a torus, the same for all cells, and the needed cells are the seen cells convolved with that
+pattern: one Fourier transform.
 """
 
 from __future__ import annotations
@@ -37,17 +39,17 @@ from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.scene.cameras import Cameras
 
 CELL = 0.25  # m
-MOST = 500_000  # cells; larger boxes get larger cells
-DEVIATIONS = 3.0  # of gusts and of the turbulent walk
+MOST = 500_000  # cells; larger domains get larger cells
+DEVIATIONS = 3.0  # standard deviations of gusts and of the turbulent walk
 GUST_RATES = (0.2, 1.25)  # lowest and highest, as `wind` draws them: hertz times `gust_seconds`
-WIDEST_SWAY, SLOWEST_SWAY = 1.7, 0.6  # of the flutter's speed and hertz, as newborn particles draw them
-LAPS = 2  # around the box that are told apart; who goes farther comes by everywhere
+WIDEST_SWAY, SLOWEST_SWAY = 1.7, 0.6  # bounds of the flutter's speed and hertz that `Air.newborn` draws, as factors
+LAPS = 2  # times around the domain that are told apart; a particle that moves farther may be anywhere
 INSTANTS = np.concatenate([[0.0], np.geomspace(1e-3, 1e6, 2048)])  # s; 1% apart
 
 
 @dataclass(frozen=True)
 class Sight:
-    """Cells of a domain; none at all where all air matters."""
+    """Cells of a domain that are seen and needed; there are no cells where all air is seen."""
 
     lower: Float[ndarray, "3"]
     """Corner of the first cell, m."""
@@ -66,9 +68,16 @@ class Sight:
     def of(
         domain: Domain, cameras: Cameras, *, distance: float, margin: float, slowest: float, fastest: float, wind: Wind
     ) -> Sight:
-        """What those cameras (rigid, metric frame) see up to a depth of `distance` metres; without cameras, everything.
+        """The region of sight of cameras; without cameras, everything.
 
-        `margin` in metres widens what is seen; particles settle with `slowest` to `fastest` m/s in that wind.
+        Args:
+            domain: the simulated air.
+            cameras: rigid, in metres.
+            distance: depth in metres up to which particles are seen.
+            margin: metres by which each pyramid of view is widened.
+            slowest: smallest terminal speed of the particles, m/s.
+            fastest: largest terminal speed of the particles, m/s.
+            wind: the wind that carries them.
 
         Raises:
             ValueError: a length or speed is negative or infinite, or slowest > fastest.
@@ -91,15 +100,18 @@ class Sight:
 
     @property
     def share(self) -> float:
-        """Part of the box that is needed."""
+        """Share of the domain that is needed, 0-1."""
         return float(self.needed_cells.mean()) if self.needed_cells.size else 1.0
 
     def needed(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Whether a particle there is seen or may still come into sight; outside of the box by wrapped x, y and clipped z."""
+        """Whether a particle at each point (m) is seen or may still come into view.
+
+        Outside of the domain x and y are wrapped and z is clipped.
+        """
         return self._look_up(self.needed_cells, points)
 
     def seen(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Whether a camera may see a particle there; outside of the box as `needed`."""
+        """Whether a camera may see a particle at each point (m); points outside of the domain are treated as in `needed`."""
         return self._look_up(self.seen_cells, points)
 
     def _look_up(self, cells: Bool[ndarray, "x y z"], points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
@@ -110,7 +122,7 @@ class Sight:
 
 
 class Reach(NamedTuple):
-    """How far a particle may have moved within each of the intervals between INSTANTS, in metres."""
+    """Bounds of a particle's displacement in metres within each of the intervals between INSTANTS."""
 
     with_wind: Float[ndarray, " t"]
     against_wind: Float[ndarray, " t"]
@@ -120,7 +132,7 @@ class Reach(NamedTuple):
 
 
 def _shape(size: Float[ndarray, "3"]) -> Int[ndarray, "3"]:
-    """How many cells make a box."""
+    """Number of cells along each axis of a domain with `size` in metres."""
     cell = max(CELL, (size.prod() / MOST) ** (1 / 3))
     while np.ceil(size / cell).prod() > MOST:
         cell *= 1.01
@@ -128,7 +140,7 @@ def _shape(size: Float[ndarray, "3"]) -> Int[ndarray, "3"]:
 
 
 def _planes(cameras: Cameras, distance: float, margin: float) -> Float[ndarray, "t 6 4"]:
-    """Planes around each pyramid of view, `margin` outside of it: normal . x + offset >= 0 inside. Same cameras are merged."""
+    """Planes `margin` metres outside of each pyramid of view: normal . x + offset >= 0 inside. Equal cameras are merged."""
     viewmats = cameras.viewmats.detach().cpu().double().numpy()
     corners = np.array([[0, 0, 1], [cameras.width, 0, 1], [cameras.width, cameras.height, 1], [0, cameras.height, 1]], float)
     rays = corners @ np.linalg.inv(cameras.Ks.detach().cpu().double().numpy()).transpose(0, 2, 1)
@@ -145,13 +157,16 @@ def _planes(cameras: Cameras, distance: float, margin: float) -> Float[ndarray, 
 def _seen(
     lower: Float[ndarray, "3"], cell: Float[ndarray, "3"], shape: Int[ndarray, "3"], planes: Float[ndarray, "t 6 4"]
 ) -> Bool[ndarray, "x y z"]:
-    """Cells that no plane of some camera cuts off as a whole. A pyramid meets each column of cells in one interval."""
+    """Cells that are seen by a camera: no plane of its pyramid has the whole cell outside.
+
+    The pyramid cuts one interval out of each column of cells.
+    """
     x, y = (lower[axis] + cell[axis] * (np.arange(shape[axis]) + 0.5) for axis in range(2))
-    edges = np.zeros((shape[0] * shape[1], shape[2] + 1), np.int32)  # of intervals: +1 where one begins, -1 behind its end
+    edges = np.zeros((shape[0] * shape[1], shape[2] + 1), np.int32)  # +1 where an interval begins, -1 behind its end
     for plane in planes:
         normal, offset = plane[:, :3], plane[:, 3] + np.abs(plane[:, :3]) @ cell / 2 + 1e-6
         flat = normal[:, :1, None] * x[:, None] + normal[:, 1:2, None] * y + offset[:, None, None]
-        # Height where a plane cuts the line through a column's centres; nearly upright ones cut it far away or nowhere.
+        # Height at which a plane cuts the line through a column's centres; a nearly upright plane cuts it far away.
         slope = np.where(np.abs(normal[:, 2]) < 1e-9, 1e-9, normal[:, 2])
         height = ((-flat / slope[:, None, None] - lower[2]) / cell[2] - 0.5).clip(-1, shape[2])
         first = np.ceil(height[slope > 0].max(0, initial=0.0)).astype(int).ravel()
@@ -163,7 +178,7 @@ def _seen(
 
 
 def _reach(wind: Wind, top: float, slowest: float, fastest: float) -> Reach:
-    """Bounds of the displacement, see the module; all grow with time but the least fall, which may go up at first."""
+    """Bounds of the displacement, see the module. All grow with time except `at_least_down`, which may be negative at first."""
     begin, end = INSTANTS[:-1], INSTANTS[1:]
     full = wind.speed * float(law_of_the_wall(np.array([top]), wind.roughness, wind.reference_height)[0])
     still = wind.gust_seconds / (math.pi * np.geomspace(*GUST_RATES, 64))
@@ -171,7 +186,7 @@ def _reach(wind: Wind, top: float, slowest: float, fastest: float) -> Reach:
     variance = 2 * wind.diffusivity * end
     if wind.turbulence > 0:
         eddy = wind.largest_eddy / (2 * math.pi * (wind.turbulence + slowest / 4))
-        # t - T (1 - exp(-t / T)); at first that is the small difference of both
+        # t - T (1 - exp(-t / T)); for small t that is a small difference, which t^2 / (2 T) bounds
         slowed = np.minimum(end + eddy * np.expm1(-end / eddy), end**2 / (2 * eddy))
         variance = variance + 2 * wind.turbulence**2 * eddy * slowed
     walk = DEVIATIONS * np.sqrt(variance)
@@ -190,10 +205,10 @@ def _reach(wind: Wind, top: float, slowest: float, fastest: float) -> Reach:
 def _pattern(
     shape: Int[ndarray, "3"], cell: Float[ndarray, "3"], reach: Reach, direction_degrees: float
 ) -> Bool[ndarray, "x y dz"]:
-    """Which displacements in cells are possible: x and y modulo the box, then down by -(z - 1) ... z - 1 cells.
+    """Which displacements in cells are possible: x and y modulo the domain, then down by -(z - 1) ... z - 1 cells.
 
-    For each axis: in which intervals of time is it possible? A displacement is if there is a common one. Between two points,
-    of cells n apart, lies anything from n - 1 to n + 1 cells; the bounds take what is easiest to reach.
+    Each axis gives the intervals of time in which it allows the displacement; the displacement is possible if they have one in
+    common. Points in cells n apart are n - 1 to n + 1 cells apart; the bounds take the distance that is easiest to reach.
     """
     fall = cell[2] * np.arange(1 - shape[2], shape[2])
     early = np.searchsorted(reach.down, fall - cell[2])
@@ -201,7 +216,7 @@ def _pattern(
     early = np.maximum(early, possible.argmax(1))
     late = np.where(possible.any(1), len(reach.down) - 1 - possible[:, ::-1].argmax(1), -1)
 
-    # All places around the box up to LAPS, laid out in a plane; beyond, whoever has had the time to get there is anywhere.
+    # All cells up to LAPS around the domain, laid out in a plane. A particle that had time to move farther may be anywhere.
     farthest = np.hypot(np.maximum(reach.with_wind, reach.against_wind), reach.across)
     size = shape[:2] * cell[:2]
     laps = np.minimum(LAPS, np.ceil(farthest[late.max()] / size)).astype(int)
@@ -223,9 +238,10 @@ def _pattern(
 def _swept(seen: Bool[ndarray, "x y z"], pattern: Bool[ndarray, "x y dz"]) -> Bool[ndarray, "x y z"]:
     """Cells from which some displacement of the pattern leads to a seen cell."""
     layers = seen.shape[2]
-    # From i to j = i + d sideways and i - d down: a correlation in x and y, a convolution in z with offset layers - 1.
+    # A displacement d leads from i to i + d in x and y and to i - d in z: a correlation in x and y, a convolution in z with
+    # offset layers - 1.
     turned = np.roll(pattern[::-1, ::-1], 1, (0, 1)).astype(float)
-    # What runs over the end of so many layers comes out before the first or behind the last of those that are kept.
+    # With so many layers, entries that wrap around the end stay outside of the layers that are kept.
     shape = (*seen.shape[:2], next_fast_len(2 * layers - 1, real=True) or 0)
     spectrum = np.fft.rfftn(seen.astype(float), shape, (0, 1, 2)) * np.fft.rfftn(turned, shape, (0, 1, 2))
     return np.fft.irfftn(spectrum, shape, (0, 1, 2))[:, :, layers - 1 : 2 * layers - 1] > 0.5

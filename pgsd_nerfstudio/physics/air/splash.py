@@ -1,4 +1,4 @@
-"""The crown of a drop: droplets that leave an impact with a share of its energy and live until they come down again."""
+"""Splashes of drops: droplets leave an impact with a share of its energy and fly until their next contact."""
 
 from __future__ import annotations
 
@@ -10,14 +10,21 @@ from pgsd_nerfstudio.effects.surface_response import Splash
 from pgsd_nerfstudio.physics.air.air import Air
 from pgsd_nerfstudio.physics.bodies import SPLASHED, Bodies
 
-LIFT = 0.004  # m above the surface at which droplets begin
-STEEP = (35.0, 65.0)  # degrees above the surface, between which a crown throws its droplets
+LIFT = 0.004  # m above the surface at which droplets start
+STEEP = (35.0, 65.0)  # degrees above the surface, between which droplets fly off
 
 
 def droplets_of(
     splash: Splash, drops: Bodies, masses: Float[ndarray, " n"], speeds: Float[ndarray, " n"]
 ) -> Int[ndarray, " n"]:
-    """How many droplets each drop makes; `masses` in kg of one real drop, `speeds` at impact in m/s. Droplets make none."""
+    """How many droplets each drop makes. Droplets of a splash make none.
+
+    Args:
+        splash: the effect's splashes.
+        drops: particles at their contacts.
+        masses: kg of one real drop.
+        speeds: at the impact, m/s.
+    """
     energy = 0.5 * masses * speeds**2
     count = np.minimum(np.floor(energy / splash.joule_per_droplet), splash.most).astype(int)
     return np.where(drops.kinds & SPLASHED, 0, count)
@@ -26,10 +33,20 @@ def droplets_of(
 def splashed(
     air: Air, splash: Splash, drops: Bodies, normals: Float[ndarray, "n 3"], rng: np.random.Generator
 ) -> tuple[Bodies, Float[ndarray, " n"]]:
-    """Droplets of impacts at the drops' positions, without ids, and the share of each drop that they carry off.
+    """Droplets of impacts.
 
-    Each stands for as many real ones as its drop does. Together they have `Splash.energy` of the impact's kinetic energy, but
-    none is faster than the impact.
+    A droplet represents as many real droplets as its drop represents real drops. All droplets of an impact together have the
+    share `Splash.energy` of its kinetic energy, but no droplet is faster than the impact.
+
+    Args:
+        air: the air that droplets enter.
+        splash: the effect's splashes.
+        drops: particles at their contacts.
+        normals: of the surface at the contacts.
+        rng: source of the draws.
+
+    Returns:
+        The droplets, without ids, and the share of each drop's mass that its droplets carry off, 0-1.
     """
     material = air.effect.material
     masses = material.mass(drops.diameters.astype(np.float64))

@@ -1,14 +1,13 @@
-"""Moving air: a mean wind that gusts, slowed by the ground, and turbulence that carries no divergence.
+"""Moving air: a mean wind with gusts, slowed by the ground, and turbulence without divergence.
 
-The turbulence is a sum of Fourier modes of a vector potential A = sum_m g(z) b_m sin(2 pi (k_m . (x - U t) + s_m t + p_m)),
-u = curl A: free of divergence whatever g is, with g chosen to calm the air at the ground. The modes are drawn once by seed,
-their energy follows Kolmogorov's -5/3 law (Kraichnan, "Diffusion by a random velocity field", 1970, is the same construction in
-free air), and U t carries the pattern along (Taylor's frozen flow). The mean wind follows the logarithmic law of the wall.
-Everything is a function of place and time: no state to store, any frame can be computed alone.
+The turbulence is the curl of a vector potential, a sum of Fourier modes A = sum_m g(z) b_m sin(2 pi (k_m . (x - U t) + s_m t +
+p_m)). It has no divergence for any g; g is chosen to calm the air at the ground. The modes are drawn once from the seed, and
+their energy follows Kolmogorov's -5/3 law (Kraichnan, "Diffusion by a random velocity field", 1970, has the same construction
+in free air). U t carries the pattern along (Taylor's frozen flow). The mean wind follows the logarithmic law of the wall. All
+is a function of place and time, so no state is stored and any frame can be computed alone.
 
-Where obstacles stand in the way (`deflection`) the mean wind goes around them, and the potential of the turbulence is ramped
-down beside them, as g does above the ground: also free of divergence (Bridson, Hourihan & Nordenstam, "Curl-noise for
-procedural fluid flow", 2007).
+Obstacles (`deflection`) deflect the mean wind. Beside them the potential of the turbulence is ramped down, as g does above the
+ground, which keeps it free of divergence (Bridson, Hourihan & Nordenstam, "Curl-noise for procedural fluid flow", 2007).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ GUST_WAVES = 6
 
 
 class Obstructed(Protocol):
-    """What obstacles change in a wind; `deflection.Deflection` is one."""
+    """Change of a wind by obstacles; `deflection.Deflection` has it."""
 
     @property
     def first(self) -> Float[ndarray, "3"]:
@@ -42,21 +41,35 @@ class Obstructed(Protocol):
         ...
 
     def velocity(self, points: Float[ndarray, "n 3"], wind: Float[ndarray, "2"]) -> Float[ndarray, "n 3"]:
-        """Difference to the undisturbed wind in m/s, where that is `wind` at the reference height."""
+        """Difference to the undisturbed wind in m/s.
+
+        Args:
+            points: m.
+            wind: undisturbed wind along x and y at the reference height, m/s.
+        """
         ...
 
     def shelter(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
-        """How much turbulence is left, 0-1, and the gradient of that in 1/m."""
+        """Share of the turbulence that is left, 0-1, and its gradient in 1/m, at points in metres."""
         ...
 
     def nodes(self, wind: Float[ndarray, "2"], dtype: DTypeLike) -> tuple[ndarray, ndarray, ndarray]:
-        """For the kernel of `airborne`: velocities at nodes [i, j, k, 3], what is left of turbulence, where it is not all."""
+        """Arrays for the kernel of `airborne`.
+
+        Args:
+            wind: undisturbed wind along x and y at the reference height, m/s.
+            dtype: of the first two arrays.
+
+        Returns:
+            Spline coefficients of the difference to the undisturbed wind [i, j, k, 3], the share of the turbulence that is left
+            [i, j, k], and whether that share is below 1 at any of the eight nodes from each node on [i, j, k].
+        """
         ...
 
 
 @dataclass(frozen=True)
 class WindField:
-    """One draw of a wind; phases in turns."""
+    """One realisation of a random wind; phases are in turns."""
 
     waves: Float[ndarray, "m 3"]
     """Wave vectors in turns per metre."""
@@ -65,21 +78,31 @@ class WindField:
     potentials: Float[ndarray, "m 3"]
     """b: amplitude of the vector potential, m^2/s."""
     drifts: Float[ndarray, " m"]
-    """s: how fast each mode changes by itself, turns/s."""
+    """s: rate at which each mode changes by itself, turns/s."""
     phases: Float[ndarray, " m"]
+    """p: phase of each mode at the origin at time 0."""
     mean: Float[ndarray, "2"]
     """Mean wind at the reference height, m/s."""
     gusts: Float[ndarray, "2 w 3"]
-    """Along and across the wind: amplitude, hertz and phase of each wave of the gusts."""
+    """Amplitude, hertz and phase of each of w waves of the gusts, along and across the wind."""
     gustiness: float
+    """Root mean square of the gusts along the wind, relative to the mean wind; across it is half as large."""
     reference_height: float
+    """m."""
     roughness: float
+    """Roughness length of the ground, m."""
     deflection: Obstructed | None = None
-    """How obstacles turn it aside; None in open country."""
+    """Change of the wind by obstacles; None in open country."""
 
     @staticmethod
     def draw(wind: Wind, seed: int, deflection: Obstructed | None = None) -> WindField:
-        """The wind of that seed, around those obstacles if given."""
+        """Draw the modes and gusts of a wind.
+
+        Args:
+            wind: speed, direction, gusts and turbulence.
+            seed: of all random numbers.
+            deflection: change of the wind by obstacles; None in open country.
+        """
         rng = np.random.default_rng([seed, 0x317D])
         count = max(wind.modes, 0) if wind.turbulence > 0 else 0
         magnitude = np.geomspace(1 / wind.largest_eddy, 1 / wind.smallest_eddy, count) if count else np.zeros(0)
@@ -110,7 +133,7 @@ class WindField:
         )
 
     def still(self) -> WindField:
-        """The same field with nothing moving; for tests and figures."""
+        """The same field without mean wind and turbulence; for tests and figures."""
         return replace(self, swirls=0 * self.swirls, potentials=0 * self.potentials, mean=0 * self.mean)
 
     @property
@@ -130,7 +153,12 @@ class WindField:
         return (self.phases + (self.drifts - self.waves[:, :2] @ self.mean) * time) % 1.0
 
     def velocity(self, points: Float[ndarray, "n 3"], time: float) -> Float[ndarray, "n 3"]:
-        """Air velocity in m/s; the plain form that the kernel of `airborne` is judged by."""
+        """Air velocity in m/s at points in metres; the plain form that checks the kernel of `airborne`.
+
+        Args:
+            points: m, z up.
+            time: s.
+        """
         profile = law_of_the_wall(points[:, 2], self.roughness, self.reference_height)
         calm, slope = calming(points[:, 2])
         angle = 2 * math.pi * (points @ self.waves.T + self.phases_at(time))
@@ -146,7 +174,7 @@ class WindField:
 
 
 def _spread_directions(count: int, rng: np.random.Generator) -> Float[ndarray, "m 3"]:
-    """Directions that cover the sphere evenly (golden spiral), in random order, turned at random."""
+    """Unit vectors that cover the sphere evenly (golden spiral), in random order and with a random rotation."""
     at = np.arange(count) + 0.5
     z, turn = 1 - 2 * at / max(count, 1), math.pi * (1 + math.sqrt(5)) * at
     flat = np.sqrt(1 - z**2)

@@ -1,1 +1,1 @@
-"""Laws of weather: how fast it falls, how large and how many its particles are, how wind meets the ground."""
+"""Laws of weather: terminal speeds, sizes and numbers of particles, and the wind near the ground."""

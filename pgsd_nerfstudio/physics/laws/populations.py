@@ -1,4 +1,4 @@
-"""Laws of what an effect emits: how fast each size falls, how many of each size a cubic metre of air holds."""
+"""Laws of the particles of an effect: the terminal speed of each size and the number of each size in a cubic metre of air."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ _LAWS = {
 
 
 def fall_speed(diameter: Float[ndarray, " n"], material: Material) -> Float[ndarray, " n"]:
-    """Terminal speed in m/s of particles with `diameter` in metres.
+    """Terminal speed in m/s of particles.
+
+    Args:
+        diameter: metres.
+        material: chooses the law and the factor on it.
 
     Raises:
         ValueError: a diameter is outside the range for which the law was made.
@@ -32,9 +36,15 @@ def fall_speed(diameter: Float[ndarray, " n"], material: Material) -> Float[ndar
 
 
 def number_density(diameter: Float[ndarray, " d"], emission: Emission, material: Material) -> Float[ndarray, " d"]:
-    """Particles per m^3 of air and metre of diameter, at ascending diameters.
+    """Particles per m^3 of air and metre of diameter.
 
-    All of the water that is asked for, or `share` of the extinction, is carried by this range of sizes.
+    The density is scaled so that the sizes from the first to the last diameter carry all of the emission's water, or `share` of
+    its extinction.
+
+    Args:
+        diameter: metres, ascending.
+        emission: kind of particles and their intensity.
+        material: chooses terminal speed and mass.
     """
     if emission.kind == "snowflakes":
         melted = snowfall.melted_diameter(material.mass(diameter))
@@ -58,15 +68,19 @@ def extinction(emission: Emission) -> float:
 
 
 def cross_section(diameter: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
-    """Extinction cross-section in m^2 of particles much larger than the wavelength: twice their shadow."""
+    """Extinction cross-section in m^2 of particles much larger than the wavelength: twice their geometric cross-section.
+
+    Args:
+        diameter: metres.
+    """
     return 0.5 * np.pi * diameter**2
 
 
 def integral(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> float:
-    """Trapezoidal integral."""
+    """Trapezoidal integral of `density` over the abscissas `at`."""
     return float(cumulative(density, at)[-1])
 
 
 def cumulative(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
-    """Trapezoidal integral up to each abscissa."""
+    """Trapezoidal integral of `density` up to each of the abscissas `at`."""
     return cumulative_trapezoid(density, at, initial=0.0)

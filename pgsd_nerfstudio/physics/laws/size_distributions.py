@@ -1,10 +1,10 @@
-"""How many particles of which size are in a cubic metre of air: rain, fog, sand and dust.
+"""Size distributions of rain, fog, sand and dust: how many particles of each size are in a cubic metre of air.
 
-Rain: Marshall & Palmer, "The distribution of raindrops with size" (1948). Fog: log-normal with the extinction, effective radius
-and variance of the models of Shettle & Fenn (1979, AFGL-TR-79-0214), which are gamma distributions of the radius in µm:
-r^3 exp(-0.3 r) of 20 per cm^3 and r^6 exp(-3 r) of 200 per cm^3. Sand: the sand populations of desert soils of Tegen et al.
-(2002), as ECHAM-HAM holds them. Dust: the background modes of d'Almeida (1987), as the Community Land Model holds them.
-Everything is in metres; a distribution is N(D) in 1/m^4: particles per m^3 of air and metre of diameter.
+Rain follows Marshall & Palmer, "The distribution of raindrops with size" (1948). Fog is log-normal with the extinction,
+effective radius and variance of the models of Shettle & Fenn (1979, AFGL-TR-79-0214), which are gamma distributions of the
+radius in µm: r^3 exp(-0.3 r) of 20 per cm^3 and r^6 exp(-3 r) of 200 per cm^3. Sand has the sand populations of desert soils of
+Tegen et al. (2002), as given in ECHAM-HAM. Dust has the background modes of d'Almeida (1987), as given in the Community Land
+Model. Lengths are in metres. A distribution is N(D) in 1/m^4: particles per m^3 of air and metre of diameter.
 """
 
 from __future__ import annotations
@@ -30,13 +30,17 @@ class Distribution(Protocol):
     """Particles per m^3 of air over their diameter, between two diameters."""
 
     @property
-    def smallest(self) -> float: ...
+    def smallest(self) -> float:
+        """Metres."""
+        ...
 
     @property
-    def largest(self) -> float: ...
+    def largest(self) -> float:
+        """Metres."""
+        ...
 
     def density(self, diameter: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-        """N(D) in 1/m^4; 0 outside."""
+        """N(D) in 1/m^4 at diameters in metres; 0 outside of the two bounds."""
         ...
 
     def moment(self, order: float) -> float:
@@ -44,11 +48,11 @@ class Distribution(Protocol):
         ...
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
-        """Diameters of `count` particles in metres, drawn by number."""
+        """Random diameters of `count` particles in metres."""
         ...
 
     def scaled(self, factor: float) -> Distribution:
-        """As many times the particles, in the same sizes."""
+        """The same sizes with `factor` times as many particles."""
         ...
 
 
@@ -80,7 +84,7 @@ class Exponential:
         return self.intercept * math.gamma(order + 1) / self.slope ** (order + 1) * (high - low)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
-        # Inverse of the distribution function, counted from the smallest so that large slopes lose no digits.
+        # Inverse of the distribution function, measured from the smallest diameter so that large slopes lose no digits.
         share = rng.uniform(size=count) * -math.expm1(-self.slope * (self.largest - self.smallest))
         return self.smallest - np.log1p(-share) / self.slope
 
@@ -93,9 +97,9 @@ class LogNormal:
     """Diameters whose logarithm is normally distributed, between two diameters."""
 
     number: float
-    """Particles per m^3, were there no smallest and largest."""
+    """Particles per m^3 if there were no bounds on the diameter."""
     median: float
-    """Diameter below which half of that number lies, in metres."""
+    """Median of the unbounded distribution, in metres."""
     spread: float
     """Geometric standard deviation, above 1."""
     smallest: float = 0.0
@@ -109,12 +113,14 @@ class LogNormal:
 
     @staticmethod
     def of_mass(mass: float, median: float, spread: float, material: float, **ends: float) -> LogNormal:
-        """From the diameter that halves the mass, as sieves and dust models state it (Hatch & Choate 1929).
+        """The distribution with a given median of the mass, which sieves and dust models state (Hatch & Choate 1929).
 
         Args:
-            mass: kg per m^3 of air, were there no smallest and largest.
-            median: of the mass, in metres.
+            mass: kg per m^3 of air if there were no bounds on the diameter.
+            median: diameter in metres below which half of the mass is.
+            spread: geometric standard deviation, above 1.
             material: density of a particle, kg/m^3.
+            ends: `smallest` and `largest` diameter in metres.
         """
         by_number = median * math.exp(-3 * math.log(spread) ** 2)
         each = LogNormal(number=1.0, median=by_number, spread=spread).moment(3) * math.pi / 6 * material
@@ -122,12 +128,13 @@ class LogNormal:
 
     @staticmethod
     def of_effective(extinction: float, diameter: float, variance: float, **ends: float) -> LogNormal:
-        """From what light sees of particles (Hansen & Travis 1974), whatever the form of their distribution.
+        """The distribution with a given effective diameter and variance, on which scattering depends (Hansen & Travis 1974).
 
         Args:
-            extinction: of visible light, per metre, were there no smallest and largest.
+            extinction: of visible light, per metre, if there were no bounds on the diameter.
             diameter: effective diameter (third over second moment) in metres.
             variance: effective variance, relative to the square of the diameter.
+            ends: `smallest` and `largest` diameter in metres.
         """
         median, spread = diameter * (1 + variance) ** -2.5, math.exp(math.sqrt(math.log1p(variance)))
         each = LogNormal(number=1.0, median=median, spread=spread).moment(2) * math.pi / 2
@@ -147,7 +154,7 @@ class LogNormal:
     def sample(self, count: int, rng: np.random.Generator) -> Float[ndarray, " n"]:
         low, high = (float(ndtr(self._standard(end))) for end in (self.smallest, self.largest))
         drawn = self.median * self.spread ** ndtri(low + (high - low) * rng.uniform(size=count))
-        return drawn.clip(self.smallest, self.largest)  # round-off at the ends
+        return drawn.clip(self.smallest, self.largest)  # against round-off
 
     def scaled(self, factor: float) -> LogNormal:
         return replace(self, number=self.number * factor)
@@ -160,10 +167,15 @@ class LogNormal:
 
 
 def marshall_palmer(rain_rate: float, *, smallest: float = 1e-4, largest: float = 6e-3) -> Exponential:
-    """Raindrops at `rain_rate` mm/h: N0 = 8000 per m^3 and mm, Lambda = 4.1 R^-0.21 per mm, D in 0.1-6 mm.
+    """Raindrops of Marshall & Palmer (1948): N0 = 8000 per m^3 and mm, Lambda = 4.1 R^-0.21 per mm.
 
-    Their water, falling as raindrops do, brings not quite the rate they are named by: a sixth more at 1-10 mm/h,
-    a twentieth less at 200 mm/h; `with_rain_rate` makes it exact.
+    With the terminal speeds of Beard (1976) these drops bring a sixth more water than `rain_rate` at 1-10 mm/h, and a twentieth
+    less at 200 mm/h. `with_rain_rate` makes the rate exact.
+
+    Args:
+        rain_rate: mm/h.
+        smallest: smallest diameter in metres.
+        largest: largest diameter in metres.
 
     Raises:
         ValueError: the rate is outside 0.1-200 mm/h.
@@ -174,54 +186,82 @@ def marshall_palmer(rain_rate: float, *, smallest: float = 1e-4, largest: float 
 
 
 def rain_rate(drops: Distribution, speed: Speed = rain_fall_speed) -> float:
-    """Water that falls through a horizontal plane, in mm/h."""
+    """Water that falls through a horizontal plane, in mm/h.
+
+    Args:
+        drops: sizes of the drops.
+        speed: law of their terminal speeds.
+    """
     diameter = np.geomspace(max(drops.smallest, 1e-6), min(drops.largest, 7e-3), 4096)
     flux = np.pi / 6 * diameter**3 * drops.density(diameter) * speed(diameter)  # m^3 of water per m^2, s and m of diameter
     return 3.6e6 * float(trapezoid(flux, diameter))
 
 
 def with_rain_rate(drops: D, wanted: float, speed: Speed = rain_fall_speed) -> D:
-    """The same sizes, as many of them as bring `wanted` mm/h."""
+    """The same sizes, with as many drops as bring the wanted rain rate.
+
+    Args:
+        drops: sizes of the drops.
+        wanted: mm/h.
+        speed: law of their terminal speeds.
+    """
     return drops.scaled(wanted / rain_rate(drops, speed))  # type: ignore[return-value]
 
 
 def mass(particles: Distribution, material: float = WATER_DENSITY) -> float:
-    """kg of particles per m^3 of air, of spheres of `material` kg/m^3."""
+    """Mass of spherical particles, kg per m^3 of air.
+
+    Args:
+        particles: sizes of the particles.
+        material: density of a particle, kg/m^3.
+    """
     return math.pi / 6 * material * particles.moment(3)
 
 
 def extinction(particles: Distribution) -> float:
-    """Extinction of visible light per metre: twice the cross section, for particles far larger than the wavelength."""
+    """Extinction of visible light per metre by particles much larger than the wavelength: twice the geometric cross-section."""
     return 2 * math.pi / 4 * particles.moment(2)
 
 
 def visibility(particles: Distribution) -> float:
-    """Metres at which a black object fades to 2 % of contrast (Koschmieder 1924)."""
+    """Distance in metres at which the contrast of a black object falls to 2 % (Koschmieder 1924)."""
     return math.log(50.0) / extinction(particles)
 
 
 def advection_fog() -> LogNormal:
-    """Dense fog that the wind brings from the sea: effective diameter 40 µm, visibility 140 m (Shettle & Fenn's model 1)."""
+    """Dense fog from the sea: effective diameter 40 µm, visibility 140 m (model 1 of Shettle & Fenn 1979)."""
     return LogNormal.of_effective(27.9e-3, 40e-6, 1 / 6, smallest=1e-6, largest=200e-6)
 
 
 def radiation_fog() -> LogNormal:
-    """Fog of a clear night over land: effective diameter 6 µm, visibility 500 m (Shettle & Fenn's model 4)."""
+    """Fog of a clear night over land: effective diameter 6 µm, visibility 500 m (model 4 of Shettle & Fenn 1979)."""
     return LogNormal.of_effective(7.82e-3, 6e-6, 1 / 9, smallest=1e-6, largest=200e-6)
 
 
 def blown_sand(mass: float) -> LogNormal:
-    """`mass` kg per m^3 of medium and fine sand: median of the mass 158 µm, spread 2.0 (Tegen et al. 2002)."""
+    """Medium and fine sand: median of the mass 158 µm, spread 2.0 (Tegen et al. 2002).
+
+    Args:
+        mass: kg per m^3 of air.
+    """
     return LogNormal.of_mass(mass, 158e-6, 2.0, QUARTZ_DENSITY, smallest=20e-6, largest=2e-3)
 
 
 def coarse_sand(mass: float) -> LogNormal:
-    """`mass` kg per m^3 of coarse sand: median of the mass 707 µm, spread 2.0 (Tegen et al. 2002)."""
+    """Coarse sand: median of the mass 707 µm, spread 2.0 (Tegen et al. 2002).
+
+    Args:
+        mass: kg per m^3 of air.
+    """
     return LogNormal.of_mass(mass, 707e-6, 2.0, QUARTZ_DENSITY, smallest=20e-6, largest=5e-3)
 
 
 def desert_dust(mass: float) -> tuple[LogNormal, LogNormal, LogNormal]:
-    """`mass` kg per m^3 of dust that stays aloft when the sand has settled, in three modes (d'Almeida 1987, background)."""
+    """Three modes of dust, which stays in the air when the sand has settled (d'Almeida 1987, background).
+
+    Args:
+        mass: kg per m^3 of air, of all modes together.
+    """
     first, second, third = (
         LogNormal.of_mass(share * mass, median, spread, QUARTZ_DENSITY)
         for share, median, spread in ((0.036, 0.832e-6, 2.1), (0.957, 4.82e-6, 1.9), (0.007, 19.38e-6, 1.6))
