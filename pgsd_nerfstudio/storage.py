@@ -1,7 +1,7 @@
-"""Content-addressed storage of what is costly to make: meshes, motion priors, the demo scene.
+"""Content-addressed storage of results that are costly to compute: meshes, motion priors, the demo scene.
 
-A file is named by the hash of everything it was made from, so a stale one is never read. Files are written beside and then
-renamed: a half-written file never carries the final name.
+A file is named by the hash of everything it was made from, so a stale file is never read. A file is written under a temporary
+name and then renamed, so a half-written file never carries the final name.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,19 @@ from torch import Tensor
 
 
 def cache_dir() -> Path:
-    """Where made things are kept: $PGSD_CACHE, else ~/.cache/pgsd_nerfstudio."""
+    """The folder of all stored files: $PGSD_CACHE, else ~/.cache/pgsd_nerfstudio."""
     return Path(os.environ.get("PGSD_CACHE") or Path.home() / ".cache" / "pgsd_nerfstudio")
 
 
 def content_key(*parts: Any) -> str:
-    """Hash of tensors, arrays, dataclasses, paths and plain values: 16 hex digits.
+    """Hash of the parts, in their order: 16 hexadecimal digits of SHA-256.
+
+    Args:
+        parts: tensors, arrays, dataclasses, mappings, lists, tuples, paths and plain values, nested as deep as needed. The name
+            of a dataclass and the names of its fields count.
 
     Raises:
-        TypeError: a part is of a kind that has no stable content.
+        TypeError: a part is of a type that has no stable content.
     """
     digest = hashlib.sha256()
     for part in parts:
@@ -63,27 +68,49 @@ def _feed(digest: Any, part: Any) -> None:
         raise TypeError(f"no stable content hash for a {type(part).__name__}")
 
 
-def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
-    """Write tensors and a JSON-able description as one safetensors file, atomically.
+@contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`, and rename it to `path` when the block ends; a block that fails leaves no file.
+
+    Args:
+        path: the final name; its folder is made where it is missing.
 
     Raises:
-        OSError: the file could not be written (disk full, no permission); nothing is left behind.
+        OSError: the folder could not be made, or the file could not be renamed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
     try:
-        data = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        save_file(data, beside, metadata={"about": json.dumps(dict(about or {}))})
-        beside.replace(path)
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
+    """Write tensors as one safetensors file, atomically.
+
+    Args:
+        path: the final name; its folder is made where it is missing.
+        tensors: tensors of any device by name.
+        about: a description that JSON can hold, stored with the tensors.
+
+    Raises:
+        OSError: the file could not be written (disk full, no permission); no file is left behind.
+    """
+    try:
+        with atomic_write(path) as temporary:
+            data = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+            save_file(data, temporary, metadata={"about": json.dumps(dict(about or {}))})
     except (OSError, SafetensorError) as error:
-        beside.unlink(missing_ok=True)
         raise OSError(
             f"could not write {path}: {error}; free some space or set PGSD_CACHE to a folder on another disk"
         ) from error
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Tensors and description of a stored file; None where there is none, or where it is damaged (then it is removed)."""
+    """The tensors and the description of a stored file; None if the file is missing or damaged. A damaged file is removed."""
     if not path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""Writes a camera path for `ns-render camera-path`: a slow flight between two training views while the whole weather passes.
+"""Write a camera path for `ns-render camera-path`: a slow path between two training views while the whole weather passes.
 
 python scripts/make_camera_path.py --load-scene demo --output path.json
 """
@@ -18,14 +18,14 @@ from pgsd_nerfstudio.scene.camera_path import choose_views, fly
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPath:
-    """A slow flight between two training views, as a camera path for ns-render."""
+    """A slow path between two training views, written for ns-render."""
 
     load_scene: str
     """The scene that ns-train was given."""
     data: Path | None = None
     """The data that ns-train was given."""
     output: Path = Path("camera_path.json")
-    """Where the camera path goes."""
+    """File that the camera path is written to."""
     width: int = 544
     """Width in pixels."""
     height: int = 352
@@ -35,9 +35,10 @@ class CameraPath:
     fps: int = 25
     """Frames per second."""
     views: tuple[int, int] | None = None
-    """Numbers of the two training views; chosen by itself if not given."""
+    """Indices of the two training views. By default two that look at the middle of the scene."""
 
     def write(self) -> None:
+        """Write the file and print its name."""
         scene = open_scene(self.load_scene, self.data, None)
         frames = round(self.seconds * self.fps)
         first, last = self.views or choose_views(scene.cameras, scene.frame)

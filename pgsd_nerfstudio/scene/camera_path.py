@@ -1,4 +1,4 @@
-"""Where the preview's camera goes: slowly from one training view towards another, so that it shows only what was captured."""
+"""A slow camera path from one training view towards another, so that the camera shows only what was captured."""
 
 from __future__ import annotations
 
@@ -7,13 +7,23 @@ import torch
 
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 from pgsd_nerfstudio.scene.frame import Frame
+from pgsd_nerfstudio.scene.scene import Scene
 
-TURN = 25.0  # degrees between the two views: parallax without leaving what both of them saw
-DEGREES_PER_SECOND = 3.0  # a calm hand; falling flakes are to be seen, not the camera
+TURN = 25.0  # degrees between the two views: enough for parallax, and both views saw what lies between them
+DEGREES_PER_SECOND = 3.0  # slow enough that the motion of the particles is seen and not that of the camera
+SLOPE = 20.0  # degrees below the horizon: views that look up see sky, views that look straight down see no snow fall
 
 
 def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
-    """Two training views about 25 degrees apart that look at the middle of the scene, as seen from its ground."""
+    """Choose two training views about 25 degrees apart that look at the middle of the scene and slightly down.
+
+    Args:
+        cameras: the training views, in scene units; at least one.
+        frame: the metric frame of the scene.
+
+    Returns:
+        Indices of the first and the last view; 0 and 0 if there is only one.
+    """
     if len(cameras) == 1:
         return 0, 0
     poses = cameras.opengl()
@@ -22,19 +32,34 @@ def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
     aside = torch.rad2deg(torch.arccos((torch.nn.functional.normalize(-centers, dim=1) * forward).sum(1).clamp(-1.0, 1.0)))
     rotations = poses[:, :3, :3]
     turn = torch.rad2deg(roma.rotmat_geodesic_distance(rotations[:, None], rotations[None, :]))
-    # Views that look up see sky, views that look straight down see no snow fall: a slope of 20 degrees shows both.
-    slope = (torch.rad2deg(torch.arcsin(-forward[:, 2].clamp(-1.0, 1.0))) - 20.0).abs()
+    slope = (torch.rad2deg(torch.arcsin(-forward[:, 2].clamp(-1.0, 1.0))) - SLOPE).abs()
     cost = (turn - TURN).abs() + (aside + slope)[:, None] + (aside + slope)[None, :]
     cost.fill_diagonal_(float("inf"))
     best = int(cost.argmin())
     return best // len(cameras), best % len(cameras)
 
 
-def fly(cameras: Cameras, first: int, last: int, *, start: int, frames: int, fps: float) -> Cameras:
-    """Frames start .. start + frames of a slow flight from view `first` to view `last`, where it stays.
+def slow_path(
+    scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, views: tuple[int, int] | None = None
+) -> Cameras:
+    """Cameras of some frames of a slow path from one training view to another.
 
-    A flight is never faster than its shots need: all frames of one second turn the camera by at most 3 degrees.
+    The path spans `start + frames` frames, or more where the camera would turn by more than 3 degrees in a second.
+
+    Args:
+        scene: the scene with its training views.
+        frames: number of frames that are asked for.
+        fps: frames per second.
+        start: first frame that is asked for.
+        views: numbers of the views that the path leads from and to; by default `choose_views`.
+
+    Raises:
+        ValueError: there is no such view.
     """
+    cameras = scene.cameras
+    first, last = views or choose_views(cameras, scene.frame)
+    if not (0 <= first < len(cameras) and 0 <= last < len(cameras)):
+        raise ValueError(f"views must lie in 0-{len(cameras) - 1}, the training views of this scene, got {first} {last}")
     poses = cameras.opengl()[[first, last], :3, :3]
     turn = float(torch.rad2deg(roma.rotmat_geodesic_distance(poses[0], poses[1])))
     whole = max(2, start + frames, round(turn / DEGREES_PER_SECOND * fps))

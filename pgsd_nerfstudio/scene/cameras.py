@@ -1,7 +1,7 @@
 """Pinhole cameras of one clip or one capture, in the convention of the rasterizers.
 
-OpenCV axes (x right, y down, z forward), world to camera. nerfstudio's own cameras are OpenGL, camera to world
-(x right, y up, z back): `Cameras.from_opengl` and `Cameras.opengl` convert.
+The matrices lead from the world to the camera, with OpenCV axes (x right, y down, z forward). nerfstudio's matrices lead from
+the camera to the world, with OpenGL axes (x right, y up, z back); `Cameras.from_opengl` and `Cameras.opengl` convert.
 """
 
 from __future__ import annotations
@@ -31,20 +31,27 @@ class Cameras:
         return self.viewmats.shape[0]
 
     def __getitem__(self, index: int | slice | Tensor) -> Cameras:
-        """Some of the cameras; a single index keeps the leading dimension."""
+        """The chosen cameras; a single index keeps the leading dimension."""
         if isinstance(index, int):
             index = [index]  # type: ignore[assignment]
         return Cameras(self.viewmats[index], self.Ks[index], self.width, self.height)
 
     @staticmethod
     def from_opengl(c2w: Float[Tensor, "t 3|4 4"], Ks: Float[Tensor, "t 3 3"], width: int, height: int) -> Cameras:
-        """From nerfstudio's camera-to-world matrices."""
+        """Cameras from nerfstudio's matrices.
+
+        Args:
+            c2w: camera to world, OpenGL axes, scene units.
+            Ks: intrinsics in pixels.
+            width: of the images in pixels.
+            height: of the images in pixels.
+        """
         full = torch.eye(4).repeat(c2w.shape[0], 1, 1).to(c2w)
         full[:, :3] = c2w[:, :3]
         return Cameras(torch.linalg.inv(full @ OPENGL_TO_OPENCV.to(c2w)), Ks, width, height)
 
     def opengl(self) -> Float[Tensor, "t 4 4"]:
-        """Camera-to-world matrices with nerfstudio's axes."""
+        """Camera-to-world matrices with OpenGL axes, as nerfstudio has them."""
         return torch.linalg.inv(self.viewmats) @ OPENGL_TO_OPENCV.to(self.viewmats)
 
     @property
@@ -56,7 +63,7 @@ class Cameras:
         return Cameras(self.viewmats.to(device), self.Ks.to(device), self.width, self.height)
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same views in another image size: the wider of the two fields of view is cropped, never stretched."""
+        """The same views in another image size in pixels; what does not fit the new shape is cropped, never stretched."""
         zoom = max(width / self.width, height / self.height)
         Ks = self.Ks.clone()
         Ks[:, 0, 0] *= zoom
@@ -67,7 +74,14 @@ class Cameras:
 
 
 def interpolate(cameras: Cameras, first: int, last: int, frames: int) -> Cameras:
-    """`frames` cameras on the way from one view to another: straight centres, shortest rotation (slerp)."""
+    """Cameras on the way from one view to another: centres on a straight line, rotations by slerp along the shorter arc.
+
+    Args:
+        cameras: the views to choose from.
+        first: index of the view at the start.
+        last: index of the view at the end.
+        frames: number of cameras, both ends included.
+    """
     poses = cameras.opengl()[[first, last]]
     at = torch.linspace(0.0, 1.0, frames, dtype=poses.dtype, device=poses.device)
     quats = roma.rotmat_to_unitquat(poses[:, :3, :3])

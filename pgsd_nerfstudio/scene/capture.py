@@ -1,7 +1,7 @@
 """Cameras and photographs of a capture from nerfstudio's transforms.json.
 
-Only pinhole cameras are known downstream: lens distortion (k1, k2, k3, p1, p2) is ignored, as rasterizers of Gaussians
-do; fisheye and panoramic captures are refused.
+Rasterizers of Gaussians know only pinhole cameras, so lens distortion (k1, k2, k3, p1, p2) is ignored, and fisheye and
+panoramic captures are refused.
 """
 
 from __future__ import annotations
@@ -24,13 +24,20 @@ PINHOLES = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "P
 
 
 def read_capture(data: Path) -> tuple[Cameras, tuple[Path, ...]]:
-    """Cameras in the coordinates of the file's own poses, and their photographs, both sorted by file name as nerfstudio does.
+    """Cameras and photographs of a capture, both sorted by file name as nerfstudio sorts them.
 
-    `data` is a transforms.json or its folder. A photograph that is missing on disk keeps its camera. Where the image sizes
-    differ, all cameras take the most frequent size.
+    A camera stays in the list if its photograph is missing on disk. If the image sizes differ, all cameras take the most
+    frequent size.
+
+    Args:
+        data: a transforms.json, or the folder that holds it.
+
+    Returns:
+        The cameras in the coordinates of the file's own poses, and the paths of the photographs, one for each camera; no paths
+        if a frame names none.
 
     Raises:
-        SceneError: there is no such file, it is no transforms.json, it has no frames, or its cameras are no pinholes.
+        SceneError: the file is missing, is no transforms.json, has no frames, or its cameras are no pinholes.
     """
     path, meta = _meta(data)
     frames = sorted(meta["frames"], key=lambda frame: str(frame.get("file_path", "")))
@@ -46,7 +53,12 @@ def read_capture(data: Path) -> tuple[Cameras, tuple[Path, ...]]:
 
 
 def in_run(cameras: Cameras, data: Path, dataparser_transforms: Path) -> Cameras:
-    """Cameras of `read_capture` in the coordinates of a run: x_run = scale * (T @ inv(applied_transform)) x_saved.
+    """Cameras in the coordinates of a run: x_run = scale * (T @ inv(applied_transform)) x_saved.
+
+    Args:
+        cameras: the cameras that `read_capture(data)` returned.
+        data: the transforms.json that holds applied_transform, or its folder.
+        dataparser_transforms: the run's dataparser_transforms.json, which holds T (3x4) and the scale.
 
     Raises:
         SceneError: dataparser_transforms.json, which the run writes, is missing or damaged.
@@ -91,7 +103,7 @@ def _pose(path: Path, frame: Mapping[str, Any]) -> Float[Tensor, "4 4"]:
 
 
 def _intrinsics(path: Path, meta: Mapping[str, Any], frame: Mapping[str, Any]) -> tuple[Float[Tensor, "3 3"], int, int]:
-    """Intrinsics of one frame; values of the whole capture come first, as in nerfstudio."""
+    """Intrinsics of one frame; values of the whole capture take precedence, as in nerfstudio."""
     values = {name: meta.get(name, frame.get(name)) for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
     bad = [
         name for name, value in values.items() if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0

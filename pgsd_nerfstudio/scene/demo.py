@@ -1,8 +1,8 @@
-"""The built-in scene: a courtyard in the late afternoon, with everything about it exactly known.
+"""The built-in scene: a courtyard in the late afternoon, whose geometry and light are exactly known.
 
-Its surfaces are modelled in metres and lit once (`courtyard/`), and handed out in scene units of two metres that are turned and
-shifted against the metric frame, as a real capture's are: what mixes up units shows at once. The ground truth is the
-triangle mesh, and depth by casting rays on it.
+The surfaces are modelled in metres and lit once (`courtyard/`). The scene units are two metres long, turned and shifted against
+the metric frame, as those of a real capture are, so that code that mixes up units fails at once. The ground truth is the
+triangle mesh, and the depth found by casting rays on it.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_t
 SEED = 20
 WIDTH, HEIGHT, FOCAL = 960, 640, 1.1 * 960
 TURN = math.radians(25)
-RINGS = ((20, 3.55, 1.38, 0.98), (20, 4.75, 1.85, 0.92))  # cameras, radius, eye height, height looked at; metres
+RINGS = ((20, 3.55, 1.38, 0.98), (20, 4.75, 1.85, 0.92))  # number of cameras; radius, eye height, height looked at in metres
 
 
 @dataclass(frozen=True)
 class Model:
-    """What is made once and cached, in scene units."""
+    """The Gaussians and the mesh of the courtyard in scene units, as they are stored in the cache."""
 
     gaussians: Gaussians
     vertices: Float[Tensor, "v 3"]
     triangles: Int[Tensor, "f 3"]
     foliage: Tensor
-    """[f] bool: the triangle belongs to something leafy, where a pixel's depth is no single value."""
+    """[f] bool: the triangle belongs to foliage, where a pixel has no single depth."""
 
 
 def demo_scene() -> Scene:
-    """The courtyard, built on first use (some ten seconds) and kept in the cache.
+    """The courtyard. It is built on first use, which takes about ten seconds, and then read from the cache.
 
     >>> scene = demo_scene()
     >>> scene.frame.metres_per_unit
@@ -61,21 +61,21 @@ def demo_scene() -> Scene:
 
 
 def demo_mesh() -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
-    """Vertices (scene units) and triangles of all solid surfaces, branches and leaves; no grass blades, no ivy, no sky."""
+    """Vertices (scene units) and triangles of all solid surfaces, branches and leaves, without grass, ivy and sky."""
     model = _model()
     return model.vertices, model.triangles
 
 
 def demo_depth(cameras: Cameras) -> Float[Tensor, "t h w"]:
-    """Depth along the optical axis (scene units) at the pixel centres, by casting rays on the mesh; inf where it is missed."""
+    """Depth along the optical axis at the pixel centres, in scene units, by casting rays on the mesh; inf if a ray misses."""
     return demo_hits(cameras)[0]
 
 
 def demo_hits(cameras: Cameras) -> tuple[Float[Tensor, "t h w"], Tensor]:
-    """`demo_depth`, and whether the surface met is solid: neither sky nor foliage ([T, H, W] bool)."""
+    """`demo_depth`, and whether each ray met a solid surface, neither sky nor foliage ([T, H, W] bool)."""
     model = _model()
     scene = raycasting(model.vertices.numpy(), model.triangles.numpy())
-    # Without a triangle: the last entry, which index -1 (no hit) falls on.
+    # The last entry stands for rays without a hit, whose index is -1.
     solid = torch.cat([~model.foliage, torch.tensor([False])])
     depths, solids = [], []
     v, u = torch.meshgrid(
@@ -94,7 +94,7 @@ def demo_hits(cameras: Cameras) -> tuple[Float[Tensor, "t h w"], Tensor]:
 
 
 def demo_frame() -> Frame:
-    """Scene units of two metres, turned by 25 degrees about z; the ground below the table is not the scene's origin."""
+    """The metric frame: units of two metres, turned by 25 degrees about z; metric zero is on the ground below the table."""
     rotation = [[math.cos(TURN), -math.sin(TURN), 0.0], [math.sin(TURN), math.cos(TURN), 0.0], [0.0, 0.0, 1.0]]
     return Frame(
         2.0, torch.tensor(rotation), torch.tensor([0.10, -0.15, -0.60]), "the built-in courtyard is modelled in metres"
@@ -102,7 +102,7 @@ def demo_frame() -> Frame:
 
 
 def demo_cameras() -> Cameras:
-    """Two rings of 20 views around the table, at the eye height of a person, as a capture on foot would take them."""
+    """Two rings of 20 views around the table at the eye height of a person, as in a capture on foot; in scene units."""
     frame, poses = demo_frame(), []
     for ring, (count, radius, height, look) in enumerate(RINGS):
         for k in range(count):
@@ -121,7 +121,7 @@ def demo_cameras() -> Cameras:
 
 
 def build() -> Model:
-    """Model, light and convert the courtyard; nothing is read from or written to the cache."""
+    """Model, light and convert the courtyard without the cache."""
     rng = np.random.default_rng(SEED)
     parts = courtyard(rng)
     radiance = bake(parts)
@@ -141,7 +141,7 @@ def build() -> Model:
 
 
 def _model() -> Model:
-    # Made from nothing but code, so the code names the file.
+    # The scene depends on nothing but this code, so the hash of the code names the file.
     here = Path(__file__)
     sources = [source.read_bytes() for source in (here, *sorted(here.with_name("courtyard").glob("*.py")))]
     path = cache_dir() / f"demo-{content_key(sources)}.safetensors"

@@ -1,12 +1,13 @@
-"""Where a scene stands in the world: scene units to metres, z up, the ground at z = 0.
+"""The metric frame of a scene: scene units to metres, z up, the ground at z = 0.
 
-A capture has neither scale nor gravity of its own. Up comes from the way the cameras were held, the ground from the
-lowest opaque Gaussians below them, the scale from the height at which people hold a camera, unless it is known.
+A capture knows neither scale nor gravity. Up is estimated from the way the cameras were held, the ground from the lowest opaque
+Gaussians below them, and the scale from the height at which people hold a camera, unless it is given.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import roma
@@ -19,23 +20,23 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 CAMERA_HEIGHT = 1.5  # m above the ground, of a camera held by a standing person
 SNAP = 2.0  # degrees: an estimated up this close to +z is +z
-ORIENTED_WITHIN = 25.0  # degrees: where up cannot be estimated well, a +z this close to the cameras' mean up is trusted
+ORIENTED_WITHIN = 25.0  # degrees: if up cannot be estimated well, a +z this close to the cameras' mean up is trusted
 MIN_SPREAD = 0.05  # mean square of the horizontal axes across their main direction: views from an arc of 45 degrees
 CELLS = 32  # ground samples across the area inside the cameras' ring
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The metric frame of a scene: x_metric = metres_per_unit * rotation @ (x_scene - origin), z up, gravity along -z."""
+    """x_metric = metres_per_unit * rotation @ (x_scene - origin), with z up and gravity along -z."""
 
     metres_per_unit: float
     """Length of one scene unit in metres."""
     rotation: Float[Tensor, "3 3"]
     """Scene axes to metric axes."""
     origin: Float[Tensor, "3"]
-    """Scene point of metric zero: on the ground, below the middle of what the cameras look at."""
+    """Scene point of metric zero. It lies on the ground, below the point that the cameras look at."""
     source: str = ""
-    """Where up, ground and scale came from, in one sentence to print."""
+    """One sentence that tells how up, ground and scale were found."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.metres_per_unit) and self.metres_per_unit > 0):
@@ -50,11 +51,11 @@ class Frame:
         return self.vectors_to_scene(points) + self.origin.to(points)
 
     def vectors_to_metric(self, vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Displacements and velocities: rotated and scaled, not moved."""
+        """Displacements or velocities of scene units in metres: rotated and scaled, not shifted."""
         return vectors @ (self.metres_per_unit * self.rotation.T).to(vectors)
 
     def vectors_to_scene(self, vectors: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Metric displacements and velocities in scene units: rotated and scaled, not moved."""
+        """Metric displacements or velocities in scene units: rotated and scaled, not shifted."""
         return vectors @ (self.rotation / self.metres_per_unit).to(vectors)
 
     def cameras_to_metric(self, cameras: Cameras) -> Cameras:
@@ -66,44 +67,56 @@ class Frame:
         return replace(cameras, viewmats=viewmats)
 
     def gaussians_to_metric(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians in scene units as Gaussians in metres; the inverse of `gaussians_to_scene`, with its ValueError."""
-        if gaussians.sh_degree:
-            raise ValueError(f"only Gaussians of plain colour change frames, found SH colours of degree {gaussians.sh_degree}")
-        turn = roma.rotmat_to_unitquat(self.rotation.double()).to(gaussians.quats)  # xyzw, scene to metric
-        quats = roma.quat_product(turn.expand(len(gaussians), 4), roma.quat_wxyz_to_xyzw(gaussians.quats))
-        return replace(
-            gaussians,
-            means=self.to_metric(gaussians.means),
-            quats=roma.quat_xyzw_to_wxyz(quats),
-            scales=gaussians.scales * self.metres_per_unit,
-            displacements=None if gaussians.displacements is None else self.vectors_to_metric(gaussians.displacements),
-        )
+        """Gaussians in scene units as Gaussians in metres, the inverse of `gaussians_to_scene`; differentiable.
+
+        Raises:
+            ValueError: the colours are spherical harmonics above degree 0, as for `gaussians_to_scene`.
+        """
+        scales = gaussians.scales * self.metres_per_unit
+        return _converted(gaussians, self.rotation, self.to_metric, self.vectors_to_metric, scales)
 
     def gaussians_to_scene(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians in metres as Gaussians in scene units; differentiable.
 
         Raises:
-            ValueError: the colours depend on the viewing direction (spherical harmonics above degree 0), which would have to
-                be rotated too; what weather adds is plain RGB.
+            ValueError: the colours are spherical harmonics above degree 0. These depend on the viewing direction and would have
+                to be rotated too; the weather only adds Gaussians of plain RGB.
         """
-        if gaussians.sh_degree:
-            raise ValueError(f"only Gaussians of plain colour change frames, found SH colours of degree {gaussians.sh_degree}")
-        turn = roma.rotmat_to_unitquat(self.rotation.T.double()).to(gaussians.quats)  # xyzw, metric to scene
-        quats = roma.quat_product(turn.expand(len(gaussians), 4), roma.quat_wxyz_to_xyzw(gaussians.quats))
-        return replace(
-            gaussians,
-            means=self.to_scene(gaussians.means),
-            quats=roma.quat_xyzw_to_wxyz(quats),
-            scales=gaussians.scales / self.metres_per_unit,
-            displacements=None if gaussians.displacements is None else self.vectors_to_scene(gaussians.displacements),
-        )
+        scales = gaussians.scales / self.metres_per_unit
+        return _converted(gaussians, self.rotation.T, self.to_scene, self.vectors_to_scene, scales)
+
+
+def _converted(
+    gaussians: Gaussians,
+    rotation: Float[Tensor, "3 3"],
+    points: Callable[[Tensor], Tensor],
+    vectors: Callable[[Tensor], Tensor],
+    scales: Float[Tensor, "n 3"],
+) -> Gaussians:
+    """Gaussians in other axes: centres and displacements by the two functions, orientations by the rotation."""
+    if gaussians.sh_degree:
+        raise ValueError(f"only Gaussians of plain colour change frames, found SH colours of degree {gaussians.sh_degree}")
+    turn = roma.rotmat_to_unitquat(rotation.double()).to(gaussians.quats)  # xyzw
+    quats = roma.quat_product(turn.expand(len(gaussians), 4), roma.quat_wxyz_to_xyzw(gaussians.quats))
+    return replace(
+        gaussians,
+        means=points(gaussians.means),
+        quats=roma.quat_xyzw_to_wxyz(quats),
+        scales=scales,
+        displacements=None if gaussians.displacements is None else vectors(gaussians.displacements),
+    )
 
 
 def estimate_frame(cameras: Cameras, gaussians: Gaussians, metres_per_unit: float | None = None) -> Frame:
-    """The frame of a capture, from its cameras (scene units) and its Gaussians.
+    """Estimate the metric frame of a capture.
 
-    Up is perpendicular to the cameras' horizontal axes, or +z where that is nearly the same. The ground is level. Where no
-    scale is given, the cameras' median height above the ground is taken as 1.5 m.
+    Up is perpendicular to the cameras' horizontal axes, or +z if that is nearly the same. The ground is taken as level.
+
+    Args:
+        cameras: the training views, in scene units.
+        gaussians: the frozen scene, in scene units.
+        metres_per_unit: length of a scene unit. None: it is chosen so that the cameras' median height above the ground is
+            1.5 m.
 
     Raises:
         ValueError: there are no cameras, or `metres_per_unit` is not positive.
@@ -131,14 +144,15 @@ def estimate_frame(cameras: Cameras, gaussians: Gaussians, metres_per_unit: floa
 
 
 def _up(cameras: Cameras) -> tuple[Float[Tensor, "3"], str]:
-    """Cameras may look down, but are rarely rolled: up is what all their right-hand axes are perpendicular to.
+    """The direction perpendicular to the right-hand axes of all cameras, since cameras may look down but are rarely rolled.
 
-    That needs views from several sides; with fewer, +z if the capture was oriented to it, else the mean of the cameras' up.
+    This needs views from several sides. With fewer, up is +z if the capture was oriented to it, else the mean of the cameras'
+    own up directions.
     """
     axes = torch.linalg.inv(cameras.viewmats.double())[:, :3, :3]
     right, mean_up = axes[:, :, 0], torch.nn.functional.normalize(-axes[:, :, 1].mean(0), dim=0)  # OpenCV's y points down
     up, spread = mean_up, torch.zeros(3, dtype=torch.float64)
-    for _ in range(20):  # weighted to absolute deviations: a few cameras held sideways do not tilt it
+    for _ in range(20):  # the weights minimise absolute deviations, so that a few cameras held sideways do not tilt the result
         weight = 1 / (right @ up).abs().clamp_min(1e-2)[:, None]
         spread, vectors = torch.linalg.eigh((weight * right).T @ right / weight.sum())
         up = vectors[:, 0] * (vectors[:, 0] @ mean_up).sign()
@@ -159,7 +173,12 @@ def _numbers(vector: Float[Tensor, "3"]) -> str:
 def attention(cameras: Cameras, gaussians: Gaussians) -> tuple[Float[Tensor, "3"], float]:
     """The point nearest to all optical axes (least squares) and the cameras' median distance from it.
 
-    Cameras that look outward or all one way have no such point before them: then the middle of what lies before them.
+    Cameras that look outward or all in one direction have no such point before them. For them the point lies half the median
+    distance of the Gaussians ahead of their mean position, and that median is the distance.
+
+    Args:
+        cameras: at least one, in scene units.
+        gaussians: the frozen scene, in scene units.
     """
     centers, forward = cameras.centers.double(), torch.linalg.inv(cameras.viewmats.double())[:, :3, 2]
     middle = centers.mean(0)
@@ -176,7 +195,10 @@ def attention(cameras: Cameras, gaussians: Gaussians) -> tuple[Float[Tensor, "3"
 def _ground(
     gaussians: Gaussians, up: Float[Tensor, "3"], middle: Float[Tensor, "3"], radius: float, camera_height: Float[Tensor, ""]
 ) -> tuple[Float[Tensor, ""], str]:
-    """Height along `up` of the level that most of the area inside the cameras' ring has as its lowest opaque Gaussians."""
+    """Height of the ground along `up`: the level on which most of the area inside the cameras' ring has its lowest Gaussians.
+
+    Only opaque Gaussians count. The second value tells how the ground was found.
+    """
     axes = _rotation_to_z(up)
     local = (gaussians.means.double().cpu() - middle) @ axes.T
     heights = local[:, 2] + middle @ up
@@ -185,8 +207,8 @@ def _ground(
     if int(inside.sum()) < 20:
         level = camera_height - radius / 2
         return level, "no opaque Gaussians below the cameras, so the ground is taken half a ring's radius below them"
-    # One vote a cell: a finely modelled table must not outvote a plain floor. The tenth percentile passes over stray
-    # Gaussians below the floor.
+    # Each cell has one vote, so that a finely modelled table does not outvote a plain floor. A cell votes for its tenth
+    # percentile, which ignores stray Gaussians below the floor.
     cell = ((local[inside, :2] / radius + 1) * (CELLS / 2)).long().clamp(0, CELLS - 1)
     order = torch.argsort(heights[inside], stable=True)
     cell_id, sorted_heights = (cell[:, 0] * CELLS + cell[:, 1])[order], heights[inside][order]

@@ -1,7 +1,7 @@
-"""The record every room hands on: a set of 3D Gaussians.
+"""A set of 3D Gaussians, the record that all rooms share.
 
-Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023). Values are the activated ones (linear
-scales, opacities in 0..1), not the logarithms and logits that checkpoints store.
+Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering" (2023). The values are activated (linear scales,
+opacities in 0..1); checkpoints store logarithms and logits instead.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ class Gaussians:
     """N Gaussians; all tensors share device and dtype."""
 
     means: Float[Tensor, "n 3"]
-    """Centres, in the units of the frame they live in (scene units, or metres where the owner says so)."""
+    """Centres in scene units, or in metres where the owner says so."""
     quats: Float[Tensor, "n 4"]
-    """Rotations as wxyz quaternions; consumers normalise."""
+    """Rotations as wxyz quaternions of any length; who reads them normalises them."""
     scales: Float[Tensor, "n 3"]
-    """Standard deviations along the three axes, same units as the means."""
+    """Standard deviations along the three axes, in the units of the means."""
     opacities: Float[Tensor, " n"]
     """Peak opacities, 0..1."""
     colors: Tensor
     """[N, 3] plain RGB in 0..1, or [N, K, 3] spherical harmonics with K = (degree + 1)^2, as in splatfacto."""
     displacements: Float[Tensor, "n 3"] | None = None
-    """How far each moves while the shutter is open, centred on its mean, same units; None: nothing moves. Rendered as motion
-    blur."""
+    """Displacement of each Gaussian while the shutter is open, centred on its mean, in the same units; rendered as motion blur.
+    None: nothing moves."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -54,7 +54,7 @@ class Gaussians:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors that are there, by name."""
+        """All tensors that are not None, by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     @property
@@ -73,9 +73,13 @@ class Gaussians:
         return Gaussians(**{name: tensor[which] for name, tensor in self.tensors.items()})
 
     def check_finite(self) -> None:
-        """Raises ValueError that names the first field with a NaN or infinity."""
+        """Refuse values that are not finite.
+
+        Raises:
+            ValueError: a field holds a NaN or infinity; the message names the first such field.
+        """
         for name, tensor in self.tensors.items():
-            # A sum is not finite if a value is not, and reads once; it may overflow, so it only raises the suspicion.
+            # The sum reads the tensor once and is not finite if a value is not. It may overflow too, so the values are counted.
             if not torch.isfinite(tensor.sum()) and (bad := int((~torch.isfinite(tensor)).sum())):
                 raise ValueError(f"{bad} values of the Gaussians' {name} are NaN or infinite")
 
@@ -86,7 +90,7 @@ class Gaussians:
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """One set from several of the same colour kind (all RGB, or all of one SH degree)."""
+    """Join several sets of the same kind of colour (all RGB, or all of one SH degree) in their order."""
     joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians)}
     still = [moved is None for moved in joined["displacements"]]
     joined["displacements"] = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]

@@ -1,9 +1,10 @@
-"""One door for every kind of scene: a splatfacto run, its config.yml, a checkpoint, a 3DGS .ply, or the built-in demo."""
+"""Load a scene from a splatfacto run, its config.yml, a checkpoint, a 3DGS .ply, or the built-in demo."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -13,9 +14,9 @@ from pgsd_nerfstudio.scene.scene import Scene, SceneError
 from pgsd_nerfstudio.scene.splats import read_checkpoint, read_ply
 
 RunCameras = Callable[[Path], tuple[Cameras, tuple[Path, ...]]]
-"""Cameras (in the coordinates of the splat) and photographs of a run, from its config.yml."""
+"""Function from the config.yml of a run to its cameras (in the coordinates of the splat) and photographs."""
 
-# Names of files and folders that say nothing about the scene in them.
+# Names of files and folders that do not describe the scene in them.
 NAMELESS = {"data", "pointcloud", "splat", "scene", "output", "outputs", "export", "exports", "images", "nerfstudio"}
 
 
@@ -27,16 +28,17 @@ def load_scene(
     description: str | None = None,
     run_cameras: RunCameras | None = None,
 ) -> Scene:
-    """A scene from any of its forms, with cameras and metric frame.
+    """Load a scene with its cameras and its metric frame.
 
     Args:
         path: "demo", a splatfacto run folder, its config.yml, a .ckpt of it, or a 3DGS .ply.
-        data: transforms.json or its folder. A .ply needs it (its coordinates are taken to be those of the poses there, unless
-            `data` is a splatfacto run, whose coordinates it then shares, as ns-export writes them); for a run it replaces the
-            run's own data, moved by the run's dataparser_transforms.json.
-        metres_per_unit: length of a scene unit, where it is known.
-        description: what prompts call the scene ("a garden"); made from its name where not given.
-        run_cameras: reads the cameras of a run with the run's own dataparser.
+        data: a transforms.json, its folder, or a splatfacto run. A .ply needs it: the .ply is taken to be in the coordinates of
+            the poses there, or in those of the run, as ns-export writes it. For a run it replaces the run's own data, and the
+            run's dataparser_transforms.json moves the poses.
+        metres_per_unit: length of a scene unit; None: it is estimated.
+        description: name of the scene in prompts ("a garden"); None: it is made from the name of the file.
+        run_cameras: function that reads the cameras of a run with the run's own dataparser; None: the installed one (entry
+            point group `pgsd_nerfstudio.run_cameras`), which imports nerfstudio only then.
 
     Raises:
         SceneError: the input cannot be used; the sentence says why and what to do.
@@ -74,7 +76,7 @@ def _demo(metres_per_unit: float | None, description: str | None) -> Scene:
 
 
 def _checkpoint(path: Path) -> tuple[Path, Path]:
-    """The newest checkpoint that a run folder, config.yml or .ckpt stands for, and the run's folder."""
+    """The newest checkpoint of a run folder, config.yml or .ckpt, and the run's folder."""
     if path.suffix == ".ckpt":
         return path, path.resolve().parent.parent
     run = path.resolve() if path.is_dir() else path.resolve().parent
@@ -102,6 +104,7 @@ def _run_cameras(run: Path, data: Path | None, run_cameras: RunCameras | None) -
     config = run / "config.yml"
     if not config.is_file():
         raise SceneError(f"cameras are missing: there is no {config}; pass --data with the transforms.json it was trained on")
+    run_cameras = run_cameras or _installed_reader()
     if run_cameras is None:
         raise SceneError(f"only nerfstudio reads the cameras of {run}; pass --data with the transforms.json it was trained on")
     cameras, images = run_cameras(config)
@@ -110,8 +113,13 @@ def _run_cameras(run: Path, data: Path | None, run_cameras: RunCameras | None) -
     return cameras, images
 
 
+def _installed_reader() -> RunCameras | None:
+    """What reads the cameras of a run; an entry point, so that this room does not know nerfstudio."""
+    return next((point.load() for point in entry_points(group="pgsd_nerfstudio.run_cameras")), None)
+
+
 def _described(name: str) -> str:
-    """The name with its article where it is a plain word, as in prompts: "a garden"."""
+    """The name with its article ("a garden") if it is a plain word that describes the scene, else "a scene"."""
     if not name.isalpha() or name.lower() in NAMELESS:
         return "a scene"
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name.lower()}"

@@ -1,4 +1,4 @@
-"""The frozen scene that weather is given to: Gaussians, the cameras that saw it, and where it stands in the world."""
+"""The frozen scene that the weather acts on: its Gaussians, the cameras that saw it, and its metric frame."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pgsd_nerfstudio.storage import content_key
 
 
 class SceneError(ValueError):
-    """A scene that cannot be used, in one sentence: what was expected, what was found and what to do."""
+    """The scene cannot be used; the message is one sentence: what was expected, what was found and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What `load_scene` returns; everything float32 on the CPU, in scene units."""
+    """A frozen scene as `load_scene` returns it; all tensors are float32 on the CPU, in scene units."""
 
     name: str
     """Short name for files and headings."""
@@ -29,15 +29,15 @@ class Scene:
     cameras: Cameras
     """The training views."""
     frame: Frame
-    """Scene units to metres, z up."""
+    """The metric frame: scene units to metres, z up."""
     images: tuple[Path, ...] = ()
-    """The training photographs, one a camera and in their order; empty where they are unknown."""
+    """The training photographs, one for each camera and in the same order; empty if they are unknown."""
     description: str = "a scene"
-    """What prompts call it, such as "a garden"."""
+    """Name of the scene in prompts, such as "a garden"."""
     mesh: tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]] | None = None
-    """Exact vertices (scene units) and triangles, where the scene was built from them; captures have none."""
+    """Exact vertices (scene units) and triangles of a scene that was built from them; None for captures."""
 
     def content_key(self) -> str:
-        """Hash of what weather depends on: Gaussians, cameras and the metric frame; not of names and words."""
+        """Hash of all that the weather depends on: Gaussians, cameras and metric frame, without names and descriptions."""
         frame = self.frame
         return content_key(self.gaussians, self.cameras, frame.metres_per_unit, frame.rotation, frame.origin)

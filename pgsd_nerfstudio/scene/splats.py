@@ -1,7 +1,7 @@
-"""Gaussians from files: 3DGS .ply and splatfacto checkpoints.
+"""Read Gaussians from 3DGS .ply files and splatfacto checkpoints.
 
-Both store what the optimizer moved (log scales, opacity logits); `Gaussians` holds the activated values. The .ply fields are
-those of Kerbl et al. (2023): x y z, f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 (wxyz).
+Both store the variables of the optimizer (log scales, opacity logits); `Gaussians` holds the activated values. The .ply fields
+are those of Kerbl et al. (2023): x y z, f_dc_0..2, f_rest_* channel by channel, opacity, scale_0..2, rot_0..3 (wxyz).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pgsd_nerfstudio.scene.scene import SceneError
 
 PLY_FIELDS = (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in "012"), *(f"rot_{i}" for i in "0123"))
 CHECKPOINT_FIELDS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
-# Where splatfacto's parameters lie in a state dict: since 1.1, before, and either under DistributedDataParallel.
+# Prefixes of splatfacto's parameters in a state dict: since nerfstudio 1.1, before, and both under DistributedDataParallel.
 CHECKPOINT_PREFIXES = (
     "_model.gauss_params.",
     "_model.",
@@ -31,7 +31,7 @@ CHECKPOINT_PREFIXES = (
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Gaussians of a 3DGS .ply with spherical harmonics of any degree.
+    """Read a 3DGS .ply with spherical harmonics of any degree.
 
     Raises:
         SceneError: the file is not a readable .ply, has no Gaussians or lacks a field, or a field holds a NaN or infinity.
@@ -67,7 +67,7 @@ def read_ply(path: Path) -> Gaussians:
 
 
 def read_checkpoint(path: Path) -> Gaussians:
-    """Gaussians of a splatfacto checkpoint; only tensors and plain values are read from it, nothing in it is executed.
+    """Read a splatfacto checkpoint. Only tensors and plain values are read; no code in the file is executed.
 
     Raises:
         SceneError: the file is not a readable checkpoint, is not splatfacto's or is empty, or a field holds a NaN or infinity.
@@ -77,6 +77,7 @@ def read_checkpoint(path: Path) -> Gaussians:
 
     dtypes = [np.dtype, *{type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)}]
     allowed: list[Any] = [scalar, (scalar, "numpy._core.multiarray.scalar"), *dtypes]
+    allowed_before = torch.serialization.get_safe_globals()
     try:
         with torch.serialization.safe_globals(allowed):
             stored = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -84,6 +85,9 @@ def read_checkpoint(path: Path) -> Gaussians:
         raise SceneError(f"{path} is not opened: it holds more than tensors and numbers ({_first_line(error)})") from error
     except (RuntimeError, OSError, EOFError, ValueError) as error:
         raise SceneError(f"{path} cannot be read as a checkpoint ({_first_line(error)}): copy or train it again") from error
+    finally:
+        # When the context ends, torch forgets of those that it allowed also that they were allowed before.
+        torch.serialization.add_safe_globals(allowed_before)
     state = stored.get("pipeline", stored) if isinstance(stored, Mapping) else {}
     prefix = next((p for p in CHECKPOINT_PREFIXES if f"{p}means" in state), None)
     missing = CHECKPOINT_FIELDS if prefix is None else [name for name in CHECKPOINT_FIELDS if f"{prefix}{name}" not in state]
@@ -107,7 +111,7 @@ def read_checkpoint(path: Path) -> Gaussians:
 
 
 def _activated(path: Path, raw: Mapping[str, Tensor]) -> Gaussians:
-    """Check the raw fields, in the order of `Gaussians` with the colours in two parts, and activate them."""
+    """Check the raw fields and activate them; they come in the order of `Gaussians`, with the colours in two parts."""
     means, quats, log_scales, logits, dc, rest = raw.values()
     if means.shape[0] == 0:
         raise SceneError(f"{path} is an empty scene: it holds 0 Gaussians")
@@ -135,7 +139,7 @@ def _columns(columns: Mapping[str, np.ndarray], *names: str) -> Float[Tensor, "n
 
 
 def _channel_major(path: Path, columns: Mapping[str, np.ndarray], rest: int, n: int) -> Float[Tensor, "n k 3"]:
-    """f_rest as splatfacto keeps it: the .ply lists all coefficients of red, then of green, then of blue."""
+    """f_rest in splatfacto's order; the .ply lists all coefficients of red, then of green, then of blue."""
     if rest % 3 or math.isqrt(rest // 3 + 1) ** 2 != rest // 3 + 1 or any(f"f_rest_{i}" not in columns for i in range(rest)):
         raise SceneError(
             f"{path} has {rest} f_rest fields; spherical harmonics of degree 0, 1, 2, 3 have 0, 9, 24, 45, numbered from 0"

@@ -11,7 +11,7 @@ from pgsd_nerfstudio.scene.courtyard.surfels import Part
 
 
 def courtyard(rng: np.random.Generator) -> list[Part]:
-    """Everything in the courtyard; the sky and the hills around it are `baking.backdrop`."""
+    """All parts of the courtyard; `baking.backdrop` adds the sky and the hills around it."""
     return [*masonry(rng), *plants(rng), *furniture(rng)]
 
 

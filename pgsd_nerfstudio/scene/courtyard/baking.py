@@ -1,7 +1,7 @@
 """Late-afternoon light on the courtyard: sun with ray-cast soft shadows, sky light with ambient occlusion, one bounce.
 
-Radiance is linear with an exposure of its own; `develop` turns it into the 0..1 colours that Gaussians carry. Rays that
-leave towards the sky bring its light, rays that meet a surface bring the mean colour of what they met, lit by guess.
+Radiance is linear with an exposure of its own; `develop` turns it into the 0..1 colours that Gaussians carry. A ray that
+reaches the sky brings the light of the sky; a ray that meets a part brings the mean colour of that part under the light BOUNCE.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SKY_RADIUS = 30.0
 
 
 def sky_light(direction: Array) -> Array:
-    """Linear radiance of the sky without its clouds, in unit directions [n, 3]: a gradient, a glow about the sun."""
+    """Linear radiance of the sky without clouds in unit directions [n, 3]: a vertical gradient and a glow about the sun."""
     up, toward = np.clip(direction[:, 2:], 0.0, 1.0), np.clip(direction @ SUN, 0.0, 1.0)[:, None]
     horizon, zenith = np.array([0.48, 0.42, 0.38]), np.array([0.19, 0.28, 0.43])
     return (
@@ -34,9 +34,9 @@ def sky_light(direction: Array) -> Array:
 
 
 def sky_radiance(direction: Array) -> Array:
-    """The same sky with its deck of broken cloud, slate-grey away from the sun."""
+    """Linear radiance of the sky with broken clouds in unit directions [n, 3]; the clouds are grey away from the sun."""
     up, toward = np.clip(direction[:, 2:], 0.0, 1.0), np.clip(direction @ SUN, 0.0, 1.0)[:, None]
-    # Clouds lie on a plane overhead: the lower, the flatter they look and the more they close up.
+    # The clouds lie on a plane overhead, so that near the horizon they look flatter and close up.
     deck = np.concatenate([0.9 * direction[:, :2] / (up + 0.14) * [1.0, 1.4], np.full_like(up, 0.5)], axis=1)
     thickness = noise(deck, 203, 4)[:, None]
     cover = np.clip(0.5 + 2.2 * thickness, 0, 1)
@@ -46,7 +46,7 @@ def sky_radiance(direction: Array) -> Array:
 
 
 def develop(radiance: Array) -> Array:
-    """Linear radiance to sRGB 0..1: exposure, a soft shoulder, the standard's curve."""
+    """sRGB values 0..1 of linear radiance, by exposure, a soft shoulder and the curve of sRGB."""
     exposed = 1.25 * radiance
     film = exposed * (1 + exposed / 6.0) / (1 + exposed)
     film = np.clip(film, 0.0, 1.0)
@@ -54,7 +54,12 @@ def develop(radiance: Array) -> Array:
 
 
 def bake(parts: Sequence[Part], rays: int = 40) -> Array:
-    """Linear radiance [n, 3] of the samples of all parts, in order."""
+    """Linear radiance [n, 3] of the samples of all parts, in their order.
+
+    Args:
+        parts: all parts, which cast shadows on each other.
+        rays: number of rays for the sky light of each sample.
+    """
     everything = join([p.patch for p in parts])
     albedo = np.concatenate([p.albedo for p in parts])
     leafy = np.concatenate([np.full(len(p.patch), p.leafy) for p in parts])
@@ -62,7 +67,7 @@ def bake(parts: Sequence[Part], rays: int = 40) -> Array:
     owner = np.concatenate([np.full(len(p.patch.triangles), i) for i, p in enumerate(parts)] + [[len(parts)]])
     tints = np.stack([p.albedo.mean(0) if len(p.albedo) else np.full(3, 0.2) for p in parts] + [np.zeros(3)]) * BOUNCE
     normal = everything.normal / np.linalg.norm(everything.normal, axis=1, keepdims=True)
-    # Leaves receive light from above whichever way they lie; half of it shines through.
+    # Leaves receive light from above on whichever side is up; half of it shines through.
     normal = np.where((leafy & (normal[:, 2] < 0))[:, None], -normal, normal)
     start = everything.position + 0.004 * normal + 0.012 * leafy[:, None] * normal
 
@@ -90,7 +95,7 @@ def bake(parts: Sequence[Part], rays: int = 40) -> Array:
 
 def raycasting(vertices: NDArray, triangles: NDArray) -> o3d.t.geometry.RaycastingScene:
     """A mesh that rays can be cast on."""
-    # Imported here: whoever finds the demo scene in the cache does not wait for Open3D.
+    # Open3D is slow to import, and a demo scene from the cache does not need it.
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -106,16 +111,16 @@ def as_tensor(array: NDArray) -> o3d.core.Tensor:
 
 
 def backdrop(rng: np.random.Generator) -> tuple[Patch, Array]:
-    """The far away: a dome of large Gaussians that shows the sky, wooded hills below; samples and linear radiance."""
+    """Samples and linear radiance of the background: a dome of large Gaussians that shows the sky, and wooded hills below."""
     patches, colors = [], []
-    # Cameras of the courtyard look about level: there the dome is finest.
+    # The dome is finest near the horizon, where the cameras of the courtyard look.
     for lowest, highest, spacing in ((-0.45, -0.1, 0.09), (-0.06, 0.5, 0.042), (0.52, np.pi / 2, 0.085)):
         for elevation in np.arange(lowest, highest, spacing):
             count = max(5, round(2 * np.pi * np.cos(elevation) / spacing))
             direction = _direction(2 * np.pi * (np.arange(count) + rng.uniform()) / count, np.full(count, elevation))
             patches.append(_on_dome(direction, SKY_RADIUS, np.full((count, 2), 0.8 * spacing)))
             colors.append(np.where(direction[:, 2:] < -0.08, np.array([0.05, 0.06, 0.035]), sky_radiance(direction)))
-    # Two wooded ridges, the further one paler: closed bands, above them the fringe of the crowns.
+    # Two wooded ridges, the further one paler. Each is a closed band with a fringe of tree crowns above it.
     for radius, height, color, columns in (
         (28.5, 0.10, np.array([0.13, 0.145, 0.175]), 210),
         (26.0, 0.075, np.array([0.055, 0.06, 0.055]), 240),

@@ -1,6 +1,7 @@
-"""What stands in the courtyard: the table with its vase of twigs and flowers, the bench, plants in pots.
+"""Furniture of the courtyard: the table with its vase of twigs and flowers, the bench, and plants in pots.
 
-Metres, z up, linear albedos. Gaps between boards are paint. Petals, leaves and berries are in the mesh as rhombi.
+Lengths are in metres, z is up, albedos are linear. Gaps between boards are painted. Petals, leaves and berries are rhombi of
+the mesh.
 """
 
 from __future__ import annotations

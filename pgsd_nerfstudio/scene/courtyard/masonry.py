@@ -1,7 +1,7 @@
-"""The courtyard's ground and bounds: the round terrace, the brick walls with their coping, what closes them from behind.
+"""Ground and walls of the courtyard: the round terrace, the brick walls with their coping, and the backs of the walls.
 
-Metres, z up; the terrace is the plane z = 0 and its middle is where the table stands. Colours are linear albedos. Joints and
-mortar are paint on the surfaces of the mesh.
+Lengths are in metres and z is up; the terrace is the plane z = 0 and the table stands in its middle. Colours are linear
+albedos. Joints and mortar are painted on the surfaces of the mesh.
 """
 
 from __future__ import annotations

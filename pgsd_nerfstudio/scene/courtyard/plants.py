@@ -1,8 +1,8 @@
-"""What grows in the courtyard: lawn, hedges, tree, ivy, and the leaves that have fallen.
+"""Plants of the courtyard: lawn, hedges, tree, ivy and fallen leaves.
 
-Metres, z up, linear albedos. In the triangle mesh: the soil of the lawn, the body of the hedges, trunk, branches and twigs,
-and every leaf of the tree as a rhombus. Not in the mesh: blades of grass, the leaves that clothe the hedges, ivy and fallen
-leaves; they lie within some centimetres of a surface that is.
+Lengths are in metres, z is up, albedos are linear. The triangle mesh holds the soil of the lawn, the body of the hedges, trunk,
+branches and twigs, and every leaf of the tree as a rhombus. It does not hold blades of grass, leaves of the hedges, ivy and
+fallen leaves, which lie within some centimetres of a surface of the mesh.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def plants(rng: np.random.Generator) -> list[Part]:
 
 
 def directions(rng: np.random.Generator, n: int) -> Array:
-    """Uniform on the sphere."""
+    """`n` unit vectors, uniform on the sphere."""
     d = rng.normal(size=(n, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
@@ -37,7 +37,17 @@ def directions(rng: np.random.Generator, n: int) -> Array:
 def wander(
     rng: np.random.Generator, start: Array, direction: Array, length: float, steps: int, bend: float, lift: float
 ) -> Array:
-    """A path that wanders and turns upwards on its way."""
+    """The [steps + 1, 3] points of a path with random bends that turns upwards on its way.
+
+    Args:
+        rng: source of the bends.
+        start: first point in metres.
+        direction: direction of the first step.
+        length: of the whole path in metres.
+        steps: number of straight pieces.
+        bend: standard deviation of the change of the unit direction in each step.
+        lift: upward change of the unit direction in each step.
+    """
     points, heading = [start], direction / np.linalg.norm(direction)
     for _ in range(steps):
         heading = heading + bend * rng.normal(size=3) + [0, 0, lift]
@@ -127,7 +137,7 @@ def _hedges(rng: np.random.Generator) -> list[Part]:
 
 
 def _tree(rng: np.random.Generator) -> list[Part]:
-    """Trunk, boughs, branches, twigs, each growing from the one before; leaves about the ends."""
+    """Trunk, boughs, branches and twigs, each growing from the one before, with leaves about the ends."""
     root = np.array([*TREE_AT, LAWN_LEVEL - 0.05])
     trunk = wander(rng, root, np.array([0.10, -0.08, 1.0]), 3.6, 14, 0.075, 0.06)
     radii = np.linspace(0.135, 0.035, len(trunk))
@@ -176,7 +186,7 @@ def _tree(rng: np.random.Generator) -> list[Part]:
 
 
 def _ivy(rng: np.random.Generator) -> list[Part]:
-    """Ivy that has climbed a piece of each wall."""
+    """Ivy on a part of each wall."""
     parts = []
     for turn, centre, reach, count in ((np.pi / 2, 0.9, 1.3, 1500), (0.0, 4.7, 0.85, 800)):
         tries = 8 * count

@@ -1,8 +1,8 @@
-"""Surfaces as triangles and, on the same surfaces, flat Gaussians: the clay the built-in courtyard is made of.
+"""Shapes of the built-in courtyard, each as triangles and as flat Gaussians (surfels) on the same surface.
 
-A shape is cut into cells of nearly equal size (stratified, so nothing is left open and nothing overlaps twice); every cell
-carries one surfel whose standard deviations are a fixed part of the cell. Cells along an open edge are narrower, which
-keeps silhouettes sharp. Everything is in metres, z up, numpy float64.
+A shape is cut into cells of nearly equal size, so that surfels leave no gaps and overlap evenly; every cell carries one surfel
+whose standard deviations are a fixed part of the cell. Cells along an open edge are narrower, which keeps silhouettes sharp.
+Lengths are in metres, z is up, arrays are float64.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 
-FILL = 0.63  # standard deviation / cell width: neighbours let at most 3 % of what is behind them through
+FILL = 0.63  # standard deviation / cell width; between neighbours at most 3 % of the background shows
 THICKNESS = 0.12  # of the smaller standard deviation, across the surface
 SH_CONSTANT = 0.28209479177387814  # the degree-0 spherical harmonic
 
@@ -63,18 +63,18 @@ class Patch:
 
 @dataclass(frozen=True)
 class Part:
-    """A patch of one kind of thing, painted."""
+    """A patch of one material with its colours."""
 
     name: str
     patch: Patch
     albedo: Array  # [n, 3] linear
     leafy: bool = False
-    """Thin and translucent: lit from both sides, and no place to measure depth against."""
+    """Thin and translucent: lit from both sides, and unfit to measure depth."""
     opacity: float = 0.98
 
 
 def join(patches: Sequence[Patch]) -> Patch:
-    """One patch from several."""
+    """Join several patches in their order."""
     starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
     triangles = np.concatenate([p.triangles + start for p, start in zip(patches, starts, strict=True)])
     vertices, *samples = (
@@ -84,14 +84,27 @@ def join(patches: Sequence[Patch]) -> Patch:
 
 
 def samples(position: Array, normal: ArrayLike, tangent: ArrayLike, size: ArrayLike) -> Patch:
-    """Samples without triangles; a single normal, tangent or size serves all."""
+    """Samples without triangles.
+
+    Args:
+        position: [n, 3] centres.
+        normal: [n, 3], or one [3] for all.
+        tangent: [n, 3] first axes, or one [3] for all.
+        size: [n, 2] standard deviations along the tangent and across it, or one [2] for all.
+    """
     n = len(position)
     wide = [np.broadcast_to(np.asarray(a, float), (n, k)).copy() for a, k in ((normal, 3), (tangent, 3), (size, 2))]
     return Patch(np.zeros((0, 3)), np.zeros((0, 3), np.int64), position, *wide)
 
 
 def cells(length: float, spacing: float, edge: float | None = None) -> tuple[Array, Array]:
-    """Centres and widths of cells that fill 0..length; the two outermost have the width `edge` where it is given."""
+    """Centres and widths of cells that fill 0..length.
+
+    Args:
+        length: of the whole row.
+        spacing: approximate width of a cell.
+        edge: width of the first and the last cell; None: all cells have the same width.
+    """
     if edge is None or length < 3 * edge:
         count = max(1, round(length / spacing))
         widths = np.full(count, length / count)
@@ -101,13 +114,16 @@ def cells(length: float, spacing: float, edge: float | None = None) -> tuple[Arr
     return np.cumsum(widths) - widths / 2, widths
 
 
-def rectangle(
-    corner: ArrayLike,
-    u: ArrayLike,  # one side
-    v: ArrayLike,  # the other; u x v points outwards
-    spacing: tuple[float, float],  # along u, along v
-    edge: float | None = None,
-) -> Patch:
+def rectangle(corner: ArrayLike, u: ArrayLike, v: ArrayLike, spacing: tuple[float, float], edge: float | None = None) -> Patch:
+    """A rectangle of two triangles.
+
+    Args:
+        corner: [3] point.
+        u: [3] one side, from the corner.
+        v: [3] the other side; u x v points outwards.
+        spacing: approximate widths of the cells along u and along v.
+        edge: as for `cells`.
+    """
     corner, u, v = (np.asarray(a, float) for a in (corner, u, v))
     (along, width), (across, height) = (cells(float(np.linalg.norm(a)), h, edge) for a, h in zip((u, v), spacing, strict=True))
     unit_u, unit_v = u / np.linalg.norm(u), v / np.linalg.norm(v)
@@ -119,14 +135,16 @@ def rectangle(
     )
 
 
-def box(
-    lower: ArrayLike,
-    upper: ArrayLike,
-    spacing: tuple[float, float],  # along the longest side, along the others
-    edge: float | None = None,
-    hidden: str = "",
-) -> Patch:
-    """An upright block; the faces named in `hidden` ("x-", "z-", ...) have triangles but no samples."""
+def box(lower: ArrayLike, upper: ArrayLike, spacing: tuple[float, float], edge: float | None = None, hidden: str = "") -> Patch:
+    """An upright block.
+
+    Args:
+        lower: [3] least coordinates.
+        upper: [3] greatest coordinates.
+        spacing: approximate widths of the cells along the longest side and along the others.
+        edge: as for `cells`.
+        hidden: names of the faces ("x-", "z-", ...) that have triangles but no samples.
+    """
     low, high = np.asarray(lower, float), np.asarray(upper, float)
     extent = high - low
     longest = int(np.argmax(extent))
@@ -143,7 +161,14 @@ def box(
 
 
 def lathe(profile: Sequence[tuple[float, float]], spacing: float, segments: int = 64, edge: float | None = None) -> Patch:
-    """A solid of revolution about the z axis from (radius, z) points, the outside to the right of the way along them."""
+    """A solid of revolution about the z axis.
+
+    Args:
+        profile: (radius, z) points; the outside is to the right of the way along them.
+        spacing: approximate width of a cell.
+        segments: number of triangles around the axis.
+        edge: as for `cells`.
+    """
     points = np.asarray(profile, float)
     angles = np.linspace(0.0, 2 * np.pi, segments, endpoint=False)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -182,7 +207,12 @@ def _strokes(points: Array) -> list[Array]:
 
 
 def smooth(profile: Sequence[tuple[float, float]], pieces: int = 4) -> list[tuple[float, float]]:
-    """A finer profile through the same points (Catmull-Rom); list a point twice to keep a corner there."""
+    """A finer profile through the same points (Catmull-Rom).
+
+    Args:
+        profile: (radius, z) points; a point that is listed twice stays a corner.
+        pieces: number of points for each piece of the profile.
+    """
     points = np.asarray(profile, float)
     around = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
     t = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
@@ -194,7 +224,14 @@ def smooth(profile: Sequence[tuple[float, float]], pieces: int = 4) -> list[tupl
 
 
 def tube(path: Array, radii: Array, spacing: float, sides: int = 8) -> Patch:
-    """A round branch along `path` [k, 3]; where it is thinner than the spacing it is one row of samples in its middle."""
+    """A round branch; a thin one has a single row of samples along its middle.
+
+    Args:
+        path: [k, 3] points of its middle.
+        radii: [k] radii at these points.
+        spacing: approximate width of a cell.
+        sides: number of triangles around the branch.
+    """
     forward = np.gradient(path, axis=0)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     helper = np.array([0.0, 0.0, 1.0]) if abs(forward[:, 2]).mean() < 0.8 else np.array([1.0, 0.0, 0.0])
@@ -227,7 +264,15 @@ def tube(path: Array, radii: Array, spacing: float, sides: int = 8) -> Patch:
 
 
 def cards(position: Array, direction: Array, normal: Array, length: Array, width: Array) -> Patch:
-    """Leaves and petals: one surfel each, and two triangles that form a rhombus."""
+    """Leaves and petals, each of one surfel and of two triangles that form a rhombus.
+
+    Args:
+        position: [n, 3] centres.
+        direction: [n, 3] long axes, of any length.
+        normal: [n, 3] approximate normals, of any length.
+        length: [n] along the long axis.
+        width: [n] across it.
+    """
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     normal = normal - (normal * direction).sum(1, keepdims=True) * direction
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -241,7 +286,13 @@ def cards(position: Array, direction: Array, normal: Array, length: Array, width
 
 
 def noise(points: Array, seed: int, octaves: int = 3) -> Array:
-    """Smooth pseudo-random values, mean about 0, mostly within -1..1; one bump per unit length, then per half, ..."""
+    """Smooth pseudo-random values [n] with a mean of about 0, mostly within -1..1.
+
+    Args:
+        points: [n, 3] places.
+        seed: of the values.
+        octaves: number of wavelengths, the first about one unit long and each next one half as long.
+    """
     total, weight = np.zeros(len(points)), 1.0
     for octave in range(octaves):
         scaled = points * 2.0**octave
@@ -264,12 +315,23 @@ def _hash(cell: NDArray[np.int64], seed: int) -> Array:
 
 
 def vary(color: Array, amount: Array) -> Array:
-    """One colour made brighter or darker by `amount` [n] (in e-folds), one row per sample."""
+    """One row [n, 3] per sample of a colour that is made brighter or darker.
+
+    Args:
+        color: [3], linear.
+        amount: [n] natural logarithms of the factors.
+    """
     return color * np.exp(amount)[:, None]
 
 
 def gaussians_of(patch: Patch, rgb: Array, opacity: Array) -> Gaussians:
-    """The samples as flat Gaussians of degree-0 spherical harmonics that show `rgb` (0..1), in metres."""
+    """The samples as flat Gaussians in metres, with spherical harmonics of degree 0.
+
+    Args:
+        patch: its samples.
+        rgb: [n, 3] sRGB colours in 0..1.
+        opacity: [n] peak opacities in 0..1.
+    """
     tangent = patch.tangent / np.linalg.norm(patch.tangent, axis=1, keepdims=True)
     normal = patch.normal / np.linalg.norm(patch.normal, axis=1, keepdims=True)
     across = np.cross(normal, tangent)
