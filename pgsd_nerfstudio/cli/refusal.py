@@ -1,20 +1,5 @@
-"""What a command says when it cannot do what was asked: one sentence on stderr, exit code 1."""
+"""Hands on to the commands what they say when they cannot do what was asked."""
 
-from __future__ import annotations
+from pgsd_nerfstudio.refusal import Refusal, refusing
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-
-class Refusal(Exception):
-    """The input cannot be used; the message says what was expected, what was found and what to do."""
-
-
-@contextmanager
-def refusing(*errors: type[Exception]) -> Iterator[None]:
-    """Turn the errors that mean bad input here into a Refusal; anything else stays a crash with its traceback."""
-    try:
-        yield
-    except errors as error:
-        sentence = " ".join(str(error).split())
-        raise Refusal(sentence or f"{type(error).__name__} without a message") from error
+__all__ = ["Refusal", "refusing"]

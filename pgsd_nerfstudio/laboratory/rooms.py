@@ -15,8 +15,8 @@ from typing import Literal
 
 from rich.console import Console
 
-from pgsd_nerfstudio.cli.refusal import Refusal
 from pgsd_nerfstudio.laboratory.records import Record, print_records, stamped, write_records
+from pgsd_nerfstudio.refusal import Refusal
 
 Kind = Literal["bench", "verify"]
 ROOMS = ("rendering", "surface", "weather", "physics", "dynamics", "guidance", "plugin")
