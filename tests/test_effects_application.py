@@ -193,7 +193,7 @@ def test_amounts_stop_where_an_emission_refuses_and_say_so(base):
         less = request(base.name, amount=5.0 if (end == high) == base.emission.precipitates else 0.1)
         if end > 0:
             assert applied(less, base=near).emission.intensity == end
-            assert [f"{end:g} it is" in said for said in remarks(less, base=near)] == [True]
+            assert [said.endswith(f": {end:g} is used") for said in remarks(less, base=near)] == [True]
 
 
 def test_no_parcel_of_fog_has_to_be_darker_than_opaque():
@@ -242,16 +242,16 @@ def test_gusts_grow_as_the_mean_wind_does():
     np.testing.assert_allclose(gusts[1], 3 * gusts[0], rtol=1e-9)
 
 
-def test_what_cannot_be_granted_is_said():
+def test_a_part_that_cannot_be_applied_is_remarked():
     assert remarks(request(size=2.0, amount=3.0, opacity=0.3, tumbling=3.0, accumulates=True)) == ()
     assert remarks(request("rainfall", accumulates=False)) == ()
     found = remarks(request("fog", opacity=0.5, tumbling=2.0, accumulates=True))
     assert [said.partition(":")[0] for said in found] == [
         "opacity 0.5 changes nothing",
         "tumbling 2 changes nothing",
-        "nothing will gather",
+        "nothing will accumulate",
     ]
-    assert remarks(request("rainfall", accumulates=True)) == ("nothing will gather: rainfall wets what it hits",)
+    assert remarks(request("rainfall", accumulates=True)) == ("nothing will accumulate: rainfall wets surfaces",)
 
 
 ENDS = [
@@ -292,7 +292,7 @@ def test_the_ends_of_each_range_give_looks_that_can_be_drawn(base):
         assert np.isfinite(sizes.in_air).all() and sizes.in_air[-1] > 0
 
 
-def test_every_kind_of_thing_that_the_reader_knows_is_granted():
+def test_every_kind_that_the_reader_knows_can_be_applied():
     for name in KINDS:
         asked = read(f"heavy glittering {name}").request
         assert applied(asked).name == asked.base
@@ -341,7 +341,7 @@ def test_a_preview_in_words_says_what_it_understood_and_shows_that(yard, tmp_pat
     assert effect.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
     assert "understood rain = rainfall; heavy = amount 2; purple = colour (0.50, 0.00, 0.50)" in said
     assert "Ignored: blorp" in said
-    assert "nothing will gather: rainfall wets what it hits" in said
+    assert "nothing will accumulate: rainfall wets surfaces" in said
     turned = previewed("purple snow", intensity=0.7, exposure=0.01, **where)
     assert (turned.emission.intensity, turned.appearance.exposure) == (0.7, 0.01)
     assert turned.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from pgsd_nerfstudio.effects.language_model import AskingError, ask, request_for
+from pgsd_nerfstudio.effects.language_model import LanguageModelError, ask, request_for
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.effects.request import Request
 
@@ -178,7 +178,7 @@ def test_after_nonsense_the_model_is_told_the_fault_and_asked_once_more(protocol
 @needs_library
 def test_nonsense_twice_is_an_error_that_says_what_was_wrong_and_leaves_nothing_behind(protocol, tmp_path):
     sentence = r"asked twice and gave no usable answer: size must be a number in 0.2-5, found 50"
-    with serving(protocol, json.dumps(GOOD | {"size": 50})) as server, pytest.raises(AskingError, match=sentence):
+    with serving(protocol, json.dumps(GOOD | {"size": 50})) as server, pytest.raises(LanguageModelError, match=sentence):
         asked(server, tmp_path)
     assert len(server.asked) == 2
     assert list(tmp_path.iterdir()) == []
@@ -196,7 +196,7 @@ def test_nonsense_twice_is_an_error_that_says_what_was_wrong_and_leaves_nothing_
     ],
 )
 def test_a_refusal_is_one_sentence_that_says_what_to_do(protocol, status, sentence, tries, tmp_path):
-    with serving(protocol, status) as server, pytest.raises(AskingError, match=sentence) as caught:
+    with serving(protocol, status) as server, pytest.raises(LanguageModelError, match=sentence) as caught:
         asked(server, tmp_path)
     assert len(server.asked) == tries  # what may pass is tried once more, what will not is not
     assert "\n" not in str(caught.value) and KEY not in str(caught.value) and KEY[:8] not in str(caught.value)
@@ -212,7 +212,9 @@ def test_an_error_that_passes_is_not_seen(protocol, tmp_path):
 @needs_library
 def test_silence_ends_after_the_time_that_was_given(protocol, tmp_path):
     with serving(protocol, None) as server:
-        with pytest.raises(AskingError, match=r":test-model gave no answer within 0.2 s, asked 2 times; allow it more time"):
+        with pytest.raises(
+            LanguageModelError, match=r":test-model gave no answer within 0.2 s, asked 2 times; allow it more time"
+        ):
             asked(server, tmp_path, timeout=0.2)
         assert len(server.asked) == 2
 
@@ -221,7 +223,7 @@ def test_silence_ends_after_the_time_that_was_given(protocol, tmp_path):
 @pytest.mark.parametrize("body", [b"hello", b"{}", b"[]", b"{"])
 def test_a_server_of_another_kind_is_told_apart(protocol, body, tmp_path):
     sentence = r"did not speak the protocol .* address of its API\?"
-    with serving(protocol, body) as server, pytest.raises(AskingError, match=sentence):
+    with serving(protocol, body) as server, pytest.raises(LanguageModelError, match=sentence):
         asked(server, tmp_path)
 
 
@@ -230,7 +232,9 @@ def test_where_nobody_listens_the_address_is_named_without_its_password(protocol
     with serving(protocol) as server:
         pass
     address = server.url.replace("http://", "http://me:hidden@")
-    with pytest.raises(AskingError, match=r"^\w+ at 127.0.0.1:\d+ cannot be reached \(.*\); is there a network") as caught:
+    with pytest.raises(
+        LanguageModelError, match=r"^\w+ at 127.0.0.1:\d+ cannot be reached \(.*\); is there a network"
+    ) as caught:
         ask("purple snow", model=server.model, base_url=address, cache_dir=tmp_path, timeout=5.0)
     assert "hidden" not in str(caught.value)
 
@@ -240,7 +244,7 @@ def test_without_a_key_its_name_is_said(protocol, tmp_path, monkeypatch):
     name = f"{protocol.upper()}_API_KEY"
     monkeypatch.delenv(name)
     sentence = rf"needs a key in the environment: export {name}=.*vllm:NAME"
-    with serving(protocol, json.dumps(GOOD)) as server, pytest.raises(AskingError, match=sentence):
+    with serving(protocol, json.dumps(GOOD)) as server, pytest.raises(LanguageModelError, match=sentence):
         asked(server, tmp_path)
     assert server.asked == []
 
@@ -271,11 +275,11 @@ def test_the_address_may_stand_in_the_environment(protocol, tmp_path, monkeypatc
     ],
 )
 def test_a_wrong_name_or_address_is_refused_before_anything_is_sent(model, url, sentence, tmp_path):
-    with pytest.raises(AskingError, match=sentence):
+    with pytest.raises(LanguageModelError, match=sentence):
         ask("purple snow", model=model, base_url=url, cache_dir=tmp_path)
 
 
-# What was answered is kept.
+# Answers are stored.
 
 
 @needs_library
@@ -286,28 +290,30 @@ def test_the_same_question_is_asked_once(tmp_path):
         asked(server, tmp_path, "other snow")
         ask("purple snow", model="openai:other-model", base_url=server.url, cache_dir=tmp_path)
         assert len(server.asked) == 3
-    kept = sorted(tmp_path.iterdir())
-    assert len(kept) == 3 and all(path.name.startswith("request-") and path.suffix == ".json" for path in kept)
-    told = [json.loads(path.read_text("utf-8")) for path in kept]
+    stored = sorted(tmp_path.iterdir())
+    assert len(stored) == 3 and all(path.name.startswith("request-") and path.suffix == ".json" for path in stored)
+    told = [json.loads(path.read_text("utf-8")) for path in stored]
     assert {(each["prompt"], each["model"]) for each in told} == {
         ("purple snow", "openai:test-model"),
         ("other snow", "openai:test-model"),
         ("purple snow", "openai:other-model"),
     }
-    assert all(KEY not in path.read_text("utf-8") for path in kept)
+    assert all(KEY not in path.read_text("utf-8") for path in stored)
 
 
 @needs_library
 def test_a_kept_answer_may_be_corrected_by_hand_but_not_damaged(tmp_path):
     with serving("openai", json.dumps(GOOD)) as server:
         asked(server, tmp_path)
-        (kept,) = tmp_path.iterdir()
-        told = json.loads(kept.read_text("utf-8"))
-        kept.write_text(json.dumps(told | {"request": told["request"] | {"size": 2.0}}), "utf-8")
+        (stored,) = tmp_path.iterdir()
+        told = json.loads(stored.read_text("utf-8"))
+        stored.write_text(json.dumps(told | {"request": told["request"] | {"size": 2.0}}), "utf-8")
         assert asked(server, tmp_path).size == 2.0
         for damaged in ("{", "{}", "[]", json.dumps(told | {"request": told["request"] | {"size": 20}})):
-            kept.write_text(damaged, "utf-8")
-            with pytest.raises(AskingError, match=r"kept answer .*request-\w+.json is damaged \(.*\); correct or delete it"):
+            stored.write_text(damaged, "utf-8")
+            with pytest.raises(
+                LanguageModelError, match=r"stored answer .*request-\w+.json is damaged \(.*\); correct or delete it"
+            ):
                 asked(server, tmp_path)
         assert len(server.asked) == 1
 
@@ -327,31 +333,31 @@ def test_nothing_half_written_carries_the_final_name(tmp_path, monkeypatch):
 
 
 def test_without_a_model_the_reader_answers():
-    granted = request_for("purple snow")
-    assert (granted.request, granted.by) == (read("purple snow").request, "reader")
-    assert granted.remark == "understood snow = snowfall; purple = colour (0.50, 0.00, 0.50)"
+    understanding = request_for("purple snow")
+    assert (understanding.request, understanding.by) == (read("purple snow").request, "reader")
+    assert understanding.remark == "understood snow = snowfall; purple = colour (0.50, 0.00, 0.50)"
 
 
 @needs_library
 def test_with_a_model_it_answers_and_is_named(tmp_path):
     with serving("openai", json.dumps(GOOD)) as server:
-        granted = request_for("purple snow", model=server.model, base_url=server.url, cache_dir=tmp_path)
-    assert (granted.request, granted.by) == (REQUEST, "openai:test-model")
+        understanding = request_for("purple snow", model=server.model, base_url=server.url, cache_dir=tmp_path)
+    assert (understanding.request, understanding.by) == (REQUEST, "openai:test-model")
     said = "openai:test-model was asked what 'purple snow' means: snowfall, rgb (0.50, 0.00, 0.50), glitter 0.3"
-    assert granted.remark == said
+    assert understanding.remark == said
 
 
 @needs_library
 def test_the_reader_steps_in_only_if_allowed_and_says_so(tmp_path):
     with serving("openai", 401) as server:
-        asking = {"model": server.model, "base_url": server.url, "cache_dir": tmp_path}
-        with pytest.raises(AskingError, match="refused the key"):
-            request_for("purple snow", **asking)
-        granted = request_for("purple snow", **asking, reader_fallback=True)
-    assert (granted.request, granted.by) == (read("purple snow").request, "reader")
+        server_options = {"model": server.model, "base_url": server.url, "cache_dir": tmp_path}
+        with pytest.raises(LanguageModelError, match="refused the key"):
+            request_for("purple snow", **server_options)
+        understanding = request_for("purple snow", **server_options, reader_fallback=True)
+    assert (understanding.request, understanding.by) == (read("purple snow").request, "reader")
     assert (
-        granted.remark.startswith("openai:test-model refused the key")
-        and "The built-in reader answers instead: understood snow" in granted.remark
+        understanding.remark.startswith("openai:test-model refused the key")
+        and "The built-in reader answers instead: understood snow" in understanding.remark
     )
 
 
@@ -362,7 +368,7 @@ def test_a_model_may_say_that_a_text_names_no_weather(tmp_path):
         for _ in range(2):
             with pytest.raises(ValueError, match=sentence) as caught:
                 asked(server, tmp_path, "a red truck")
-            assert not isinstance(caught.value, AskingError)  # it did answer: nobody has to step in
+            assert not isinstance(caught.value, LanguageModelError)  # it did answer: nobody has to step in
     assert len(server.asked) == 1
 
 
@@ -374,5 +380,5 @@ def test_a_text_of_no_or_too_many_characters_is_sent_to_nobody(prompt, tmp_path)
 
 def test_without_the_library_the_command_that_installs_it_is_said(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "any_llm", None)
-    with pytest.raises(AskingError, match=r"needs the library any-llm.*: pip install 'pgsd-nerfstudio\[llm\]'$"):
+    with pytest.raises(LanguageModelError, match=r"needs the library any-llm.*: pip install 'pgsd-nerfstudio\[llm\]'$"):
         ask("purple snow", model="openai:x", cache_dir=tmp_path)

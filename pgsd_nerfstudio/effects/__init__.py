@@ -1,4 +1,4 @@
-"""What falls: one Effect per weather, pure configuration, and the look it starts from."""
+"""Effects: the configuration of each weather, and the look that its particles have before training."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The look needs torch and is imported when it is asked for: `pgsd --help` knows the knobs of a weather without it."""
+    """Import the look on first use: it needs torch, and `pgsd --help` shows the options of a weather without torch."""
     if name not in ("InitialLook", "ParticleLook", "initial_look"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from pgsd_nerfstudio.effects import appearance

@@ -1,4 +1,4 @@
-"""The light of a weather: how sky, sun, exposure and colours of the whole scene follow it."""
+"""The light of a weather: how sky, sun, exposure and colours of the whole scene change under it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Ambience:
-    """What full weather makes of the light; on the way there it is mixed with the scene's own by the timeline's share."""
+    """Light of the full weather. While the weather arrives, the light is mixed with the scene's own by the timeline's share."""
 
     clouds: float = 0.0
-    """Share of the direct sun that clouds take and spread over the sky: cast shadows soften by as much. 0 leaves the sun."""
+    """Share of the direct sun that clouds take and spread over the sky, which softens shadows. 0 leaves the sun."""
     stops: float = 0.0
     """Change of exposure in stops; -1 halves the light."""
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -18,7 +18,7 @@ class Ambience:
     saturation: float = 1.0
     """Factor on the distance of colours from grey."""
     sky: tuple[float, float, float] = (0.75, 0.78, 0.82)
-    """Colour of the sky, sRGB: shown where nothing is, and mirrored by wet surfaces."""
+    """Colour of the sky, sRGB. The background shows it and wet surfaces mirror it."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.clouds <= 1 and -5 <= self.stops <= 5 and 0 <= self.saturation <= 2):

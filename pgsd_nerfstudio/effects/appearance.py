@@ -1,8 +1,8 @@
-"""The look a weather starts from: curated numbers of the Effect, varied from particle to particle.
+"""The look of particles before training: curated numbers of the Effect, varied from particle to particle.
 
-Flakes in the air take their size from the diameter that the physics drew for them: near ones are seen as flakes of several
-pixels, far ones as faint dots. On the surface every flake spreads into a thin soft patch which stands for the water that would
-have gathered there (SurfaceResponse.accumulation_speedup); patches of many sizes and tones overlap into a layer.
+An active particle takes its size from the diameter that the physics drew for it: near flakes cover several pixels, far ones are
+faint dots. A collided flake spreads into a thin soft patch, which stands for the water that would have gathered there
+(SurfaceResponse.accumulation_speedup). Patches of many sizes and tones overlap into a cover.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pgsd_nerfstudio.effects.matter import Array
 
 
 class Particles(Protocol):
-    """What a look needs to know of the simulated particles (physics.ParticleHistory has it)."""
+    """The properties of simulated particles that a look depends on; `physics.ParticleHistory` has them."""
 
     @property
     def ends(self) -> Int[Tensor, " p"]: ...
@@ -44,10 +44,12 @@ class ParticleLook:
 
     opacity: Float[Tensor, " p"]
     scales: Float[Tensor, "p 3"]
-    """Standard deviations in metres; the third axis is the thin one, along the surface normal when landed."""
+    """Standard deviations in metres; the third axis is the thin one, and along the surface normal of a collided particle."""
     rgb: Float[Tensor, "p 3"]
+    """sRGB, 0..1."""
 
     def select(self, which: Tensor) -> ParticleLook:
+        """The look of the chosen particles, by mask or by index."""
         return ParticleLook(self.opacity[which], self.scales[which], self.rgb[which])
 
     def to(self, device: torch.device | str) -> ParticleLook:
@@ -56,27 +58,35 @@ class ParticleLook:
 
 @dataclass(frozen=True)
 class InitialLook:
-    """Appearance of every particle, in the air and landed."""
+    """Appearance of every particle, active and collided."""
 
     active: ParticleLook
     collided: ParticleLook
     settle_seconds: float
+    """Time after contact in which a particle changes from the first look to the second."""
 
     def select(self, ids: Int[Tensor, " n"]) -> InitialLook:
+        """The look of the chosen particles."""
         return InitialLook(self.active.select(ids), self.collided.select(ids), self.settle_seconds)
 
     def to(self, device: torch.device | str) -> InitialLook:
         return InitialLook(self.active.to(device), self.collided.to(device), self.settle_seconds)
 
     def collided_at(self, particles: Particles, frame: int, ids: Int[Tensor, " n"]) -> ParticleLook:
-        """Look of landed particles `ids` at `frame`: each spreads from its flake to its patch within `settle_seconds`."""
+        """The look of collided particles, each of which spreads from its flake to its patch within `settle_seconds`.
+
+        Args:
+            particles: all particles, of which `ends` and `fps` are read.
+            frame: index of the frame.
+            ids: indices of the collided particles that are asked for.
+        """
         flake, patch = self.active.select(ids), self.collided.select(ids)
         if self.settle_seconds <= 0:
             return patch
         age = (frame - particles.ends[ids] + 1).clamp_min(0) / particles.fps
         grown = (age / self.settle_seconds).clamp(0, 1).to(patch.opacity)
-        grown = (grown * (2 - grown))[:, None]  # fast at first, as the area of a patch fed at a constant rate
-        # The thin axis is thin from the start: a flake lies down on contact.
+        grown = (grown * (2 - grown))[:, None]  # fast at first, as the radius of a patch whose area grows at a constant rate
+        # The thin axis is thin from the start, since a flake lies flat on contact.
         start = torch.minimum(flake.scales, patch.scales)
         return ParticleLook(
             torch.lerp(flake.opacity, patch.opacity, grown[:, 0]),
@@ -86,7 +96,16 @@ class InitialLook:
 
 
 def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> InitialLook:
-    """The look of every particle before anything is learned; the same for the same seed."""
+    """The look of every particle before training; the same seed gives the same look.
+
+    Args:
+        effect: its appearance, material and surface response are read.
+        particles: the simulated particles.
+        seed: of the variation between particles.
+
+    Returns:
+        The look on the device of the particles.
+    """
     generator = torch.Generator().manual_seed(seed)
     looks, diameters = effect.appearance, particles.diameters.cpu().float()
     active = _look(looks.active, _flake_scales(looks.active, diameters), generator)
@@ -97,7 +116,7 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
         thin = (diameters / looks.active.fades_below).clamp_max(1.0) ** 2
         active = ParticleLook(active.opacity * thin, active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
-    # No patch wider than the surface around it: nothing hangs over the edge of a table.
+    # A patch is not wider than the surface around it, so that it does not hang over the edge of a table.
     widest = (particles.rest_extents.cpu() / REACH).clamp_min(0.004)
     scales = torch.cat([torch.minimum(collided.scales[:, :2], widest[:, None]), collided.scales[:, 2:]], 1)
     scales[:, 2] = torch.minimum(scales[:, 2], 0.5 * scales[:, :2].amin(1))
@@ -109,10 +128,14 @@ FAINTEST = 1.0 / 255.0  # opacity below which a rasterizer draws nothing
 
 
 def opacity_of_extinction(cross_section: Float[Tensor, " p"], scales: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-    """Opacity with which a Gaussian takes as much light out of a view as `cross_section` m^2 of black area spread over it.
+    """Opacity with which a Gaussian takes as much light out of a view as a black area that is spread over it.
 
     Many such Gaussians then obey Beer-Lambert. The optical depth -ln(1 - a g) of a splat a g, g = exp(-r^2 / 2), integrates to
-    2 pi s^2 (Li2(a) - Li2(1 / 255)), since what is fainter than 1 / 255 is not drawn; s^2 by the geometric mean of the axes.
+    2 pi s^2 (Li2(a) - Li2(1 / 255)), as a rasterizer draws nothing fainter than 1 / 255; s is the geometric mean of the axes.
+
+    Args:
+        cross_section: black area in m^2.
+        scales: standard deviations in metres.
     """
     wanted = cross_section.double() / (2 * math.pi * scales.double().prod(1) ** (2 / 3))
     opacity = np.linspace(FAINTEST, 0.99, 4096)
@@ -120,7 +143,7 @@ def opacity_of_extinction(cross_section: Float[Tensor, " p"], scales: Float[Tens
     return torch.from_numpy(np.interp(wanted.numpy(), depth, opacity)).float()
 
 
-REACH = 1.7  # standard deviations at which a patch of opacity 0.6 has faded to 0.14: where it seems to end
+REACH = 1.7  # standard deviations at which a patch of opacity 0.6 has faded to 0.14 and seems to end
 
 
 def _flake_scales(state: StateLook, diameters: Float[Tensor, " p"]) -> Float[Tensor, "p 3"]:
@@ -130,7 +153,7 @@ def _flake_scales(state: StateLook, diameters: Float[Tensor, " p"]) -> Float[Ten
 
 
 def _patch_scales(effect: Effect, diameters: Float[Tensor, " p"], represents: Float[Tensor, " p"]) -> Float[Tensor, "p 3"]:
-    """A patch has the volume of the snow it stands for: (2 pi)^(3/2) times the product of its standard deviations."""
+    """A patch has the volume of the cover that it stands for: (2 pi)^(3/2) times the product of its standard deviations."""
     if effect.appearance.collided.scale_m is not None:
         return torch.tensor(effect.appearance.collided.scale_m).expand(len(diameters), 3)
     thickness = effect.surface.layer_thickness
@@ -140,7 +163,13 @@ def _patch_scales(effect: Effect, diameters: Float[Tensor, " p"], represents: Fl
 
 
 def layer_volume(effect: Effect, diameters: Array, represents: Array) -> Array:  # [p]
-    """m^3 of cover that landed particles stand for; arrays or tensors."""
+    """Volume in m^3 of the cover that collided particles stand for.
+
+    Args:
+        effect: its material and surface response are read.
+        diameters: [p] in metres, arrays or tensors.
+        represents: [p] number of real particles that each simulated one stands for.
+    """
     layer = effect.surface
     volumes: Any = represents * effect.material.mass(diameters) * (layer.accumulation_speedup / layer.layer_density)
     return volumes
@@ -148,11 +177,11 @@ def layer_volume(effect: Effect, diameters: Array, represents: Array) -> Array: 
 
 def _look(state: StateLook, base: Float[Tensor, "p 3"], generator: torch.Generator) -> ParticleLook:
     normal = torch.randn(base.shape[0], 5, generator=generator)
-    # One draw for the size as a whole, a weaker one for the ratio of the flat axes: flakes are not discs.
+    # One draw varies the whole size, a weaker one the ratio of the flat axes, since flakes are not discs.
     shape = 0.5 * state.scale_spread * normal[:, 1]
     log = state.scale_spread * normal[:, :1] + torch.stack([shape, -shape, torch.zeros_like(shape)], 1)
     opacity = ((state.opacity or 0.0) * (1 + state.opacity_spread * normal[:, 2])).clamp(0.05, 0.98)
     tone = (1 - state.tone_spread * normal[:, 3].abs()).clamp(0.80, 1.0)
-    tint = 1 + 0.012 * normal[:, 4:5] * torch.tensor([-1.0, 0.0, 1.0])  # bluish or warmish by a hair
+    tint = 1 + 0.012 * normal[:, 4:5] * torch.tensor([-1.0, 0.0, 1.0])  # slightly bluish or warm
     rgb = (torch.tensor(state.rgb) * tone[:, None] * tint).clamp(0.0, 1.0)
     return ParticleLook(opacity, base * torch.exp(log), rgb)

@@ -1,12 +1,11 @@
-"""What a Request makes of an Effect: the knobs of a built-in weather, turned as far as its laws allow.
+"""Apply a Request to an Effect: its factors change a built-in weather as far as the laws of that weather allow.
 
-Sizes: a particle shall look wider by the factor, and nothing else of it shall change (`fall_speed` and `amount` are for that).
-Snow has power laws over the diameter, and its spectrum is one of melted flakes, so the flake itself is enlarged: s times as
-wide, with the mass and the fall speed of the flake of which it is an enlarged copy. That is loose, as petals, leaves and
-feathers are, and the fits of Locatelli & Hobbs are still only used where they were made. Rain, sand and fog have laws that know
-the true diameter: drops above 7 mm break up (Beard 1976), the spectra of rain, blown sand and fog end at 6, 2 and 0.2 mm, and
-sizes moved towards such an end would not grow by the factor. There the diameters stay, and the Gaussian that shows a drop, a
-grain or a parcel is scaled instead.
+The factor `size` makes a particle look wider and changes nothing else; `fall_speed` and `amount` do that. Snow has power laws
+of the diameter, and its spectrum is one of melted flakes, so the flake itself is enlarged: it is s times as wide and keeps its
+mass and its fall speed. Such a flake is loose, like petals, leaves and feathers, and the fits of Locatelli & Hobbs are still
+used only where they were made. The laws of rain, sand and fog need the true diameter: drops above 7 mm break up (Beard 1976),
+and the spectra of rain, blown sand and fog end at 6, 2 and 0.2 mm, so that sizes near the end would not grow by the factor. For
+these the diameters stay, and the Gaussian that shows a drop, a grain or a parcel is scaled instead.
 """
 
 from __future__ import annotations
@@ -21,36 +20,38 @@ from pgsd_nerfstudio.effects.request import Request, Rgb
 from pgsd_nerfstudio.effects.surface_response import SurfaceResponse
 
 GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
-"""Spreads of brightness and opacity where all particles glitter. An initial look keeps brightness within 0.80-1, where contrast
-is greatest at 0.20: a third of the particles are at its dull end, a fifth stand out with 0.95 or more. At 0.60 a third of the
-snowflakes are opaque and the rest fade."""
+"""Spreads of brightness and opacity if all particles glitter. The initial look bounds the brightness to 0.80-1, and within
+these bounds a spread of 0.20 gives the greatest contrast: a third of the particles are at the dull end, and a fifth have 0.95
+or more. At 0.60 a third of the snowflakes are opaque and the others are fainter."""
 HAZE_SHARE, MATTER_SHARE = 0.35, 0.6
-"""Part of the way from the base's haze to the colour of what flies. Between flakes and drops it is mostly the same air; fog and
-dust are the haze themselves."""
+"""Part of the way from the base's haze colour to the particles' colour. Between flakes and drops the haze is mostly plain air;
+fog and dust are the haze themselves."""
 
 
 def applied(request: Request, *, base: Effect | None = None) -> Effect:
-    """The effect that a request asks for; what it says nothing about stays as the base has it.
+    """The effect that follows a request. A field at its default changes nothing; the others act as follows.
 
-    - `rgb`: colour of what flies, and of what has landed where `landed_rgb` says no other; haze and sky
-      take HAZE_SHARE of it, those of fog and sand MATTER_SHARE.
-    - `landed_rgb`: colour of what has landed.
-    - `size`: see the module.
-    - `amount`: precipitation times it, or visibility divided by it, within INTENSITIES. Fog, whose parcels stand for droplets
-      of a given extinction, gets more parcels if they are smaller or hold more, so that none has to be darker than opaque.
-    - `opacity`: of every particle, at most 1. What takes its opacity from its extinction (fog) keeps it.
-    - `glitter`: nothing here reflects, so to sparkle is to differ: brightness and opacity in the air vary more from particle to
-      particle, from the base's spreads (0) to GLITTER_TONES and GLITTER_OPACITIES (1).
+    - `rgb`: colour of the active particles, and of the collided ones if `landed_rgb` is None. Haze and sky move towards it by
+      HAZE_SHARE, or by MATTER_SHARE for fog and sand.
+    - `landed_rgb`: colour of the collided particles.
+    - `size`: see the docstring of the module.
+    - `amount`: precipitation is multiplied by it, visibility is divided by it, within INTENSITIES. The parcels of fog stand for
+      droplets of a given extinction: if they are smaller or hold more, there are more of them, so that none needs an opacity
+      above 1.
+    - `opacity`: factor for every particle, up to an opacity of 1. Fog takes its opacity from its extinction and keeps it.
+    - `glitter`: particles do not reflect, so they sparkle by contrast. Brightness and opacity of active particles vary more
+      from particle to particle, from the base's spreads (0) to GLITTER_TONES and GLITTER_OPACITIES (1).
     - `fall_speed`: factor of the law of fall speeds. At the same precipitation slower particles are closer together.
-    - `wind`: mean wind, turbulence and the eddies below it. Gusts are a share of the mean wind and grow with it.
-    - `tumbling`: speed of the swaying at the same rate, so wider circles. What does not sway by itself (all but snow) stays so.
-    - `accumulates`: False lets what would stay vanish where it lands: no cover, no opacity. True changes nothing:
-      snow and sand gather anyway, rain and fog do not (see `remarks`).
-    - `prompt`: as it is. `name` stays that of the base: the paper's physics is looked up by it.
+    - `wind`: factor of mean wind, turbulence and eddy diffusivity. Gusts are a share of the mean wind and grow with it.
+    - `tumbling`: factor of the speed of swaying at the same frequency, so that the circles are wider. Only snow sways by
+      itself.
+    - `accumulates`: False makes particles vanish where they would stay, without cover and without opacity. True changes
+      nothing: snow and sand accumulate anyway, rain and fog never do (see `remarks`).
+    - `prompt`: replaces that of the base. The name stays that of the base, since the paper's physics is chosen by it.
 
     Args:
-        base: the effect whose knobs are turned, instead of the built-in one that the request names
-            (snowfall, if it names none).
+        request: the factors and colours.
+        base: the effect that they apply to; None: the built-in one that the request names, or snowfall if it names none.
     """
     base = base or _base_of(request)
     return replace(
@@ -67,23 +68,29 @@ def applied(request: Request, *, base: Effect | None = None) -> Effect:
 
 
 def remarks(request: Request, *, base: Effect | None = None) -> tuple[str, ...]:
-    """One sentence for each part of a request that `applied` cannot follow, or not in full."""
+    """One sentence for each part of a request that `applied` cannot follow in full.
+
+    Args:
+        request: the factors and colours.
+        base: as for `applied`.
+    """
     base = base or _base_of(request)
-    emission, said = base.emission, list[str]()
-    wanted, given = _wanted_intensity(request, emission), _intensity(request, emission)
-    if given != wanted:
+    emission, sentences = base.emission, list[str]()
+    wanted, possible = _wanted_intensity(request, emission), _intensity(request, emission)
+    if possible != wanted:
         low, high = INTENSITIES[emission.kind]
-        said.append(
-            f"amount {request.amount:g} would be {wanted:g} {emission.unit}: {given:g} it is, {base.name} has {low:g}-{high:g}"
+        sentences.append(
+            f"amount {request.amount:g} would be {wanted:g} {emission.unit}, but {base.name} takes {low:g}-{high:g}: "
+            f"{possible:g} is used"
         )
     if request.opacity != 1 and base.appearance.active.opacity is None:
-        said.append(f"opacity {request.opacity:g} changes nothing: how opaque {base.name} is follows from its amount")
+        sentences.append(f"opacity {request.opacity:g} changes nothing: the opacity of {base.name} follows from its amount")
     if request.tumbling != 1 and base.wind.flutter == 0:
-        said.append(f"tumbling {request.tumbling:g} changes nothing: {base.name} does not sway by itself")
+        sentences.append(f"tumbling {request.tumbling:g} changes nothing: {base.name} does not sway by itself")
     if request.accumulates and base.surface.landing != "stays":
-        does = "wets what it hits" if base.surface.landing == "wets" else "flows along surfaces"
-        said.append(f"nothing will gather: {base.name} {does}")
-    return tuple(said)
+        does = "wets surfaces" if base.surface.landing == "wets" else "flows along surfaces"
+        sentences.append(f"nothing will accumulate: {base.name} {does}")
+    return tuple(sentences)
 
 
 def _base_of(request: Request) -> Effect:
@@ -91,7 +98,7 @@ def _base_of(request: Request) -> Effect:
 
 
 def _enlarges(material: Material) -> bool:
-    """Whether the particles themselves can have any size."""
+    """Whether the laws of a material hold for enlarged particles."""
     return material.speed_law == "power"
 
 
@@ -109,7 +116,7 @@ def _emission(request: Request, base: Effect) -> Emission:
     if _enlarges(base.material):
         emission = replace(emission, smallest=emission.smallest * request.size, largest=emission.largest * request.size)
     if emission.most is not None and not emission.precipitates and base.appearance.active.opacity is None:
-        # Opacity of a parcel: its extinction over its area, which cannot go beyond 1. Fewer than the base has would be lumps.
+        # The opacity of a parcel is its extinction over its area, at most 1. Fewer parcels than the base has would look lumpy.
         denser = base.emission.intensity / emission.intensity
         emission = replace(emission, most=round(emission.most * max(1.0, denser / request.size**2)))
     return emission
@@ -119,7 +126,7 @@ def _material(request: Request, material: Material) -> Material:
     material = replace(material, speed_factor=material.speed_factor * request.fall_speed)
     if not _enlarges(material):
         return material
-    # Mass and speed at s D are what they were at D.
+    # A particle of the diameter s D has the mass and the speed that D had before.
     return replace(
         material,
         mass_milligram=material.mass_milligram * request.size**-material.mass_exponent,
@@ -144,7 +151,7 @@ def _surface(request: Request, surface: SurfaceResponse) -> SurfaceResponse:
 
 
 def _vanishes(request: Request, surface: SurfaceResponse) -> bool:
-    """Whether what would stay is wanted gone."""
+    """Whether the request makes particles vanish that would stay."""
     return request.accumulates is False and surface.landing == "stays"
 
 
@@ -182,7 +189,7 @@ def _tinted(own: Rgb, request: Request, base: Effect) -> Rgb:
 
 
 def _look(request: Request, state: StateLook) -> StateLook:
-    """What holds in the air and landed alike."""
+    """The changes that active and collided particles share."""
     opacity = None if state.opacity is None else min(state.opacity * request.opacity, 1.0)
     scale_m = None if state.scale_m is None else _times(state.scale_m, request.size)
     return replace(state, opacity=opacity, scale_m=scale_m)

@@ -1,8 +1,8 @@
-"""What a weather is: pure configuration, no tensors, no code that runs.
+"""The configuration of a weather, without tensors and without simulation code.
 
-An Effect says what is emitted, what it is made of, how the air moves, what happens on contact, how it looks and what a video
-model is told about it. `effect("snowfall")` hands out the built-in ones; `dataclasses.replace` turns a knob.
-Lengths in metres, speeds in m/s, seconds, unless a name says otherwise.
+An Effect holds the emission, the material, the wind, the response of surfaces, the look, and the prompt for the video model.
+`effect("snowfall")` returns a built-in one; `dataclasses.replace` changes a value. Lengths are in metres, speeds in m/s and
+times in seconds, unless a name says otherwise.
 """
 
 from __future__ import annotations
@@ -18,67 +18,72 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 
 @dataclass(frozen=True, kw_only=True)
 class Wind:
-    """Moving air: a mean wind with gusts, and turbulence without divergence."""
+    """Moving air: a mean wind with gusts, and turbulence that is free of divergence."""
 
     speed: float = 0.6
     """Mean wind at `reference_height`, in m/s."""
     direction_degrees: float = 25.0
-    """Where the wind blows to, counted from the x axis towards y."""
+    """Direction that the wind blows to, counted from the x axis towards y."""
     reference_height: float = 2.0
-    """Height above ground at which `speed` holds; below, the logarithmic profile slows the wind."""
+    """Height above ground at which `speed` holds; below it the logarithmic profile slows the wind."""
     roughness: float = 0.03
     """Roughness length of the ground in metres (0.03: short grass)."""
     gustiness: float = 0.35
     """Standard deviation of the gusts, as a share of the mean wind."""
     gust_seconds: float = 4.0
-    """How long a gust typically lasts."""
+    """Typical duration of a gust."""
     turbulence: float = 0.18
     """Root mean square of each component of the turbulent velocity, in m/s."""
     largest_eddy: float = 3.0
     smallest_eddy: float = 0.35
-    """Wavelengths of the turbulence, in metres; energy falls off as the -5/3 power in between."""
+    """Largest and smallest wavelength of the turbulence in metres; between them the energy follows the -5/3 power."""
     modes: int = 32
-    """Fourier modes of the turbulence, each free of divergence by itself; a multiple of 16 fills the vector units."""
+    """Number of Fourier modes of the turbulence, each free of divergence; a multiple of 16 fills the vector units of a CPU."""
     flutter: float = 0.12
-    """Sideways speed of the swaying that each flake does on its own, in m/s."""
+    """Sideways speed in m/s of the swaying of each flake by itself."""
     flutter_hertz: float = 1.6
-    """Typical rate of that swaying."""
+    """Typical frequency of the swaying."""
     diffusivity: float = 0.0
-    """Eddy diffusivity in m^2/s of the turbulence below `smallest_eddy`: what is carried by it walks at random, sqrt(2 K t)
-    along each axis. For fog; what falls hardly feels it."""
+    """Eddy diffusivity K in m^2/s of the turbulence below `smallest_eddy`. It moves a parcel of fog at random, by sqrt(2 K t)
+    along each axis; snow, rain and sand hardly feel it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateLook:
-    """Look of all particles in one state, before anything is learned. Spreads are relative standard deviations."""
+    """Look of all particles in one state before training. Spreads are relative standard deviations."""
 
     scale_m: tuple[float, float, float] | None = None
-    """Standard deviations of the Gaussian along its three axes (third: the thin one); None: from each particle's size."""
+    """Standard deviations in metres of the Gaussian along its three axes (the third is the thin one); None: they follow from
+    the size of each particle."""
     scale_per_diameter: tuple[float, float, float] = (0.30, 0.24, 0.14)
-    """In the air, where `scale_m` is None."""
+    """Standard deviations of an active particle relative to its diameter, if `scale_m` is None."""
     scale_spread: float = 0.15
+    """Spread of the size from particle to particle."""
     opacity: float | None = 0.85
-    """None: from the extinction of the droplets that a particle stands for, so that many of them obey Beer-Lambert."""
+    """Mean peak opacity. None: it follows from the extinction of the droplets that a particle stands for, so that many of them
+    obey Beer-Lambert."""
     opacity_spread: float = 0.10
+    """Spread of the opacity from particle to particle."""
     fades_below: float = 0.0
-    """Diameter in metres below which opacity falls with the particle's area; 0: never. A rasterizer draws nothing thinner than
-    a pixel, so that spray would shine like drops."""
+    """Diameter in metres below which the opacity falls with the particle's area; 0: it never falls. A rasterizer draws nothing
+    thinner than a pixel, so without this spray would be as bright as drops."""
     rgb: tuple[float, float, float] = (0.95, 0.97, 1.0)
+    """Colour, sRGB."""
     tone_spread: float = 0.04
-    """Variation of brightness from particle to particle; brightness stays within 0.80-1."""
+    """Spread of the brightness from particle to particle; the brightness stays within 0.80-1."""
     settle_seconds: float = 0.0
-    """How long a particle takes after contact to take on this look."""
+    """Time after contact in which a particle takes on this look."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Appearance:
-    """The two looks of a particle: in the air and on the surface."""
+    """The two looks of a particle, active and collided, and the shutter time."""
 
     active: StateLook = field(default_factory=StateLook)
     collided: StateLook = field(default_factory=StateLook)
     exposure: float = 0.0
-    """How long the shutter is open, in seconds: what flies is smeared along its way by speed times exposure. 0 freezes it, as
-    snow is mostly shown; rain and sand show streaks at 1/50 s."""
+    """Shutter time in seconds: active particles are smeared by speed times this. 0 freezes them, as is usual for snow; rain and
+    sand show streaks at 1/50 s."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.exposure <= 1.0:
@@ -96,36 +101,42 @@ class Effect:
     timeline: Timeline = field(default_factory=Timeline)
     surface: SurfaceResponse = field(default_factory=SurfaceResponse)
     dense: Dense | None = None
-    """What it is where much of it moves together on a surface; None: particles never feel each other."""
+    """Material of a cover that moves as a whole, simulated by the material point method; None: particles never interact."""
     appearance: Appearance = field(default_factory=Appearance)
     haze: Haze | None = None
-    """What hangs in the air as far as one can see; None: clear air."""
+    """Medium between the particles; None: the air is clear."""
     ambience: Ambience | None = None
-    """How the light of the whole scene follows; None: it stays as it is."""
+    """Change of the light of the whole scene; None: it stays as it is."""
     prompt: str
-    """What a video model is told; {scene} stands for the description of the scene."""
+    """Prompt for the video model; {scene} stands for the description of the scene."""
     negative_prompt: str = ""
+    """Prompt of what the video model should avoid."""
 
     def prompt_for(self, description: str) -> str:
-        """The prompt with the scene's description in its place, e.g. "a garden"."""
+        """The prompt for a scene with this description, such as "a garden"."""
         return self.prompt.format(scene=description)
 
 
 EFFECTS: dict[str, Effect] = {}
-"""Every effect that has a name; filled by the modules that describe them."""
+"""The built-in effects by name; the module of each effect registers it."""
 
 
 def register(new: Effect) -> Effect:
-    """Make an effect known under its name."""
+    """Add an effect to EFFECTS under its name, and return it."""
     EFFECTS[new.name] = new
     return new
 
 
 def effect(name: str, *, intensity: float | None = None, exposure: float | None = None) -> Effect:
-    """The effect of that name, with another intensity (in the effect's own unit) or shutter time (seconds) if given.
+    """A built-in effect.
+
+    Args:
+        name: snowfall, rainfall, fog or sandstorm.
+        intensity: in the effect's own unit; None: the effect's own.
+        exposure: shutter time in seconds; None: the effect's own.
 
     Raises:
-        ValueError: there is none, then the message names the known ones; or a number is out of its range.
+        ValueError: there is no effect of that name (the message names the known ones), or a number is out of its range.
     """
     if name not in EFFECTS:
         raise ValueError(f"there is no effect {name!r}; known are: {', '.join(sorted(EFFECTS))}")

@@ -1,7 +1,7 @@
-"""Fog: droplets too small and too many to be seen one by one, carried by the wind in parcels.
+"""Fog: droplets that are too small and too many to be seen one by one, carried by the wind in parcels.
 
-Each simulated particle is a parcel of air with its droplets, all parcels with the same extinction; sizes of Shettle & Fenn's
-advection fog (1979), visibility by Koschmieder (1924): extinction = ln 50 / visibility.
+Each simulated particle is a parcel of air with its droplets; all parcels have the same extinction. The sizes are those of
+Shettle & Fenn's advection fog (1979), the visibility follows Koschmieder (1924): extinction = ln 50 / visibility.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The little grammar of a text about weather: which words belong together, which are about something else, which are negated.
+"""A small grammar for texts about weather: which words belong together, which describe something else, which are negated.
 
-A text falls into phrases at signs, "and", "with", prepositions. A phrase counts if something in it is weather, or if all of it
-describes; what ends in an unknown noun is about something else ("a red truck in purple snow").
+A text is cut into phrases at punctuation, "and", "with" and prepositions. A phrase counts if it names a weather, or if it only
+describes one; a phrase that ends in an unknown noun describes something else ("a red truck in purple snow").
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ PLACES = _words("on onto over above across against around behind beside near und
 ARTICLES = _words("a an")
 DETERMINERS = _words("the my our your this that these those its")
 LEADS = _words("in through from to")
-"""Before a determiner these name a place, else a manner: "in the dark", "in gold", "in a pale blue"."""
+"""Prepositions that lead to a place before a determiner ("in the dark"), else to a manner ("in gold", "in a pale blue")."""
 LINKS = LEADS | _words("and or but with while which who where when is are was as like of by for plus then")
 SILENT = _words(
     """it it's there be being do does will would make makes add let us me i want wants show give please create put some any all
     every fall falls falling fell down coming come comes going go moving flying fly flies drift drifts float floats swirl air
     sky everywhere ground surfaces surface effect weather color colored colors colour coloured colours full lots lot"""
 )
-"""Words that say nothing here and need no mention."""
+"""Words without a meaning for the weather, which are skipped without a report."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One to three words that mean one thing; nothing where they are unknown."""
+    """One to three words with one meaning; all meanings are None if the words are unknown."""
 
     words: str
     kind: Kind | None = None
@@ -49,6 +49,7 @@ class Item:
 
     @property
     def unknown(self) -> bool:
+        """Whether the words have no meaning here."""
         return all(v is None for v in (self.kind, self.wind, self.quality, self.rgb, self.tint, self.degree))
 
 
@@ -58,34 +59,38 @@ class Phrase:
 
     items: list[Item] = field(default_factory=list)
     place: bool = False
-    """It says where: colours and sizes there are not the weather's."""
+    """The phrase names a place, so that its colours and sizes do not describe the weather."""
 
     @property
     def counts(self) -> bool:
-        """Whether it is about the weather."""
+        """Whether the phrase is about the weather."""
         if any(item.kind or item.wind for item in self.items):
             return True
         return not self.place and not self.items[-1].unknown
 
 
 def parse(text: str) -> tuple[list[Phrase], str]:
-    """The phrases of a text, and the text without what it does not want."""
+    """Cut a text into phrases.
+
+    Returns:
+        The phrases that hold words, and the text without its negated words.
+    """
     tokens = re.findall(r"\w+(?:'\w+)*|[,.;:!?()\n]", unicodedata.normalize("NFKC", text).lower().translate(PLAIN))
     phrases: list[Phrase] = [Phrase()]
-    spoken: list[str] = []
+    wanted: list[str] = []
     excluded = inverted = led = False
     at = 0
     while at < len(tokens):
         token = tokens[at].replace("'", "")
         found, count = _longest([word.replace("'", "") for word in tokens[at : at + 3]])
-        heard = tokens[at : at + count]
+        words = tokens[at : at + count]
         at += count
         if found:
             phrases[-1].items.append(replace(found, negated=excluded or inverted))
-            heard = [] if excluded or inverted else heard
+            words = [] if excluded or inverted else words
             inverted = led = False
         elif token in NEGATIONS:
-            inverted, heard = True, []
+            inverted, words = True, []
         elif token in EXCLUSIONS | PLACES | LINKS or not token[0].isalnum():
             joins = token in {"and", "or", "nor"}
             phrases.append(Phrase(place=token in PLACES or (joins and phrases[-1].place)))
@@ -94,18 +99,18 @@ def parse(text: str) -> tuple[list[Phrase], str]:
         else:
             if token in DETERMINERS:
                 phrases[-1].place |= led
-            elif token not in ARTICLES and heard[0] not in SILENT:
+            elif token not in ARTICLES and words[0] not in SILENT:
                 phrases[-1].items.append(Item(token))
             led = False
-        spoken += [] if excluded else heard
-    return [phrase for phrase in phrases if phrase.items], _sentence(spoken)
+        wanted += [] if excluded else words
+    return [phrase for phrase in phrases if phrase.items], _joined(wanted)
 
 
 PLAIN = str.maketrans({"’": "'", "_": " ", "{": " ", "}": " "})
 
 
 def _longest(tokens: list[str]) -> tuple[Item | None, int]:
-    """What the next words mean, most words first, and how many they are."""
+    """The meaning of the next words and their number; as many words as possible are taken together."""
     for count in range(len(tokens), 0, -1):
         for form in forms(tokens[count - 1]):
             name = " ".join([*tokens[: count - 1], form])
@@ -119,11 +124,11 @@ def _longest(tokens: list[str]) -> tuple[Item | None, int]:
     return None, 1
 
 
-def _sentence(spoken: list[str]) -> str:
-    """Words in a row, without the links that nothing follows since what followed was not wanted."""
+def _joined(wanted: list[str]) -> str:
+    """The words as one text, without links and articles whose words were negated and left out."""
     dangling = LINKS | PLACES | ARTICLES | DETERMINERS | {"it's", "do", "does", "it"}
     kept: list[str] = []
-    for token in reversed(spoken):
+    for token in reversed(wanted):
         after = kept[-1] if kept else None
         ends = after is None or not after[0].isalnum() or after in {"and", "but", "or"}
         if ends and (token in dangling or not token[0].isalnum()):

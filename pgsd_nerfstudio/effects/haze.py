@@ -1,4 +1,4 @@
-"""What hangs in the air as far as one can see: droplets, flakes or dust too many and too small to be particles."""
+"""Haze: the droplets, flakes or dust in the air that are too many or too small to be simulated as particles."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Haze:
-    """A participating medium: takes light by its extinction (Beer-Lambert) and gives airlight instead (Koschmieder 1924)."""
+    """A participating medium that removes light by its extinction (Beer-Lambert) and adds airlight (Koschmieder 1924)."""
 
     rgb: tuple[float, float, float] = (0.78, 0.81, 0.84)
-    """Airlight, sRGB: the colour that everything far away takes on."""
+    """Airlight, sRGB: the colour that distant surfaces fade to."""
     amount: float = 1.0
-    """Factor on the extinction that the weather's intensity gives; 0: clear air between the particles."""
+    """Factor on the extinction that follows from the weather's intensity; 0: the air between the particles is clear."""
     patchiness: float = 0.0
-    """Standard deviation of the logarithm of the extinction from place to place; its mean stays. 0: the same everywhere."""
+    """Standard deviation of the logarithm of the extinction from place to place, at the same mean. 0: no patches."""
     patch_size: float = 12.0
-    """Wavelength in metres of the largest patches; smaller ones are weaker by the -5/3 power law of turbulence. They drift with
-    the wind."""
+    """Wavelength in metres of the largest patches. Smaller ones are weaker by the -5/3 power law of turbulence, and all drift
+    with the wind."""
     scale_height: float = math.inf
-    """Height in metres over which it thins to a third, e^-1; it is as dense as the intensity says at the ground."""
+    """Height in metres over which the haze thins to 1 / e. At the ground it is as dense as the intensity says."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.amount <= 20 and 0 <= self.patchiness <= 2):

@@ -1,9 +1,9 @@
-"""Asks a language model for the numbers of a request (paper, appearance initialization), and keeps what it answered.
+"""Ask a language model for the numbers of a request (paper, appearance initialization), and store its answer.
 
-Any provider that any-llm knows, or any server that speaks the protocol of OpenAI or Anthropic. Keys and addresses come from the
-environment (OPENAI_API_KEY and OPENAI_BASE_URL, ANTHROPIC_API_KEY and ANTHROPIC_BASE_URL, ...) and are written nowhere.
-The schema of a request is told in words and the answer is judged by Request.from_json: not every server knows structured
-output. Nothing stands in for a model that does not answer unless the caller says so.
+The model is that of any provider that any-llm knows, or of any server that speaks the protocol of OpenAI or Anthropic. Keys and
+addresses come from the environment (OPENAI_API_KEY and OPENAI_BASE_URL, ANTHROPIC_API_KEY and ANTHROPIC_BASE_URL, ...) and are
+never stored. Not every server knows structured output, so the instructions hold the schema of a request, and
+Request.from_json checks the answer. If the model does not answer, the reader answers instead only if the caller allows it.
 """
 
 from __future__ import annotations
@@ -11,18 +11,17 @@ from __future__ import annotations
 import json
 import re
 import sys
-import uuid
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from pgsd_nerfstudio.effects.reader import NO_WEATHER, check, read
+from pgsd_nerfstudio.effects.reader import NO_WEATHER, check_length, read
 from pgsd_nerfstudio.effects.request import SCHEMA, Request
+from pgsd_nerfstudio.storage import atomic_write, content_key
 from pgsd_nerfstudio.storage import cache_dir as shared_cache
-from pgsd_nerfstudio.storage import content_key
 
-RETRIES = 1  # of a request that got no answer or an error that may pass
+RETRIES = 1  # after no answer, or after an error that may pass
 MODEL = re.compile(r"[a-z0-9_]+:\S+")
 HOW_TO_NAME = (
     "PROVIDER:NAME such as openai:NAME, anthropic:NAME, or vllm:NAME for a server of your own that speaks OpenAI's protocol "
@@ -37,20 +36,20 @@ Answer with one JSON object and nothing else. It must satisfy this JSON schema:
 {json.dumps(SCHEMA)}"""
 
 
-class AskingError(ValueError):
+class LanguageModelError(ValueError):
     """The language model gave no usable answer; the message says why and what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Understanding:
-    """A request, and who understood it."""
+    """A request, and the reader or the model that made it."""
 
     request: Request
     by: str
     """The model, or the word "reader"."""
     remark: str
-    """Which model was asked and what it said; or what the reader used and ignored, and why it had to step in if a model was
-    asked first."""
+    """One text for the user: which model was asked and what it answered, or which words the reader used and ignored. If a model
+    was asked first, it also tells why the reader answered instead."""
 
 
 def request_for(
@@ -62,16 +61,20 @@ def request_for(
     timeout: float = 60.0,
     reader_fallback: bool = False,
 ) -> Understanding:
-    """What a text requests for: by a language model where one is named, else by the built-in reader.
+    """The request of a text, from a language model if one is named, else from the built-in reader.
 
     Args:
-        reader_fallback: let the reader answer where the model cannot be asked; the remark then says so.
-        model, base_url, cache_dir, timeout: as for `ask`; answers are kept in the common cache if no folder is given.
+        prompt: the text, 1-400 characters.
+        model: as for `ask`; None: the reader reads the text.
+        base_url: as for `ask`.
+        cache_dir: as for `ask`; None: the folder `requests` of the common cache.
+        timeout: as for `ask`.
+        reader_fallback: let the reader answer if the model gives no usable answer; the remark then says so.
 
     Raises:
-        AskingError: the model gave no usable answer, and the reader was not allowed to step in.
+        LanguageModelError: the model gave no usable answer, and `reader_fallback` is False.
         ValueError: the text is empty, too long or names nothing that could be in the air.
-        OSError: the answer of a model cannot be written.
+        OSError: the answer of a model cannot be stored.
     """
     if model is None:
         reading = read(prompt)
@@ -79,7 +82,7 @@ def request_for(
     folder = cache_dir or shared_cache() / "requests"
     try:
         request = ask(prompt, model=model, base_url=base_url, cache_dir=folder, timeout=timeout)
-    except AskingError as error:
+    except LanguageModelError as error:
         if not reader_fallback:
             raise
         try:
@@ -89,15 +92,17 @@ def request_for(
         return Understanding(
             request=reading.request, by="reader", remark=f"{error}. The built-in reader answers instead: {reading}"
         )
-    return Understanding(request=request, by=model, remark=f"{model} was asked what {prompt.strip()!r} means: {_told(request)}")
+    return Understanding(
+        request=request, by=model, remark=f"{model} was asked what {prompt.strip()!r} means: {_summary(request)}"
+    )
 
 
-def _told(request: Request) -> str:
-    """In one line, what a request says beside its defaults."""
+def _summary(request: Request) -> str:
+    """One line with the fields of a request that are not at their defaults."""
     defaults = {field.name: field.default for field in fields(Request)}
-    said = {name: value for name in defaults if (value := getattr(request, name)) != defaults[name] and name != "prompt"}
-    base = said.pop("base")
-    return ", ".join([str(base), *(f"{name.replace('_', ' ')} {_written(value)}" for name, value in said.items())])
+    changed = {name: value for name in defaults if (value := getattr(request, name)) != defaults[name] and name != "prompt"}
+    base = changed.pop("base")
+    return ", ".join([str(base), *(f"{name.replace('_', ' ')} {_written(value)}" for name, value in changed.items())])
 
 
 def _written(value: Any) -> str:
@@ -107,43 +112,50 @@ def _written(value: Any) -> str:
 
 
 def ask(prompt: str, *, model: str, base_url: str | None = None, cache_dir: Path, timeout: float = 60.0) -> Request:
-    """What a text requests for, in the words of a language model; the same question is asked once and its answer kept.
+    """The request of a text from a language model. The same question is asked once, and its answer is stored.
 
     Args:
+        prompt: the text, 1-400 characters.
         model: PROVIDER:NAME, such as "openai:gpt-5-mini".
-        base_url: address of the server, if it is not the provider's own or the one in the environment.
-        cache_dir: folder of the answers, request-HASH.json each; the hash is that of prompt, model, address and instructions.
-        timeout: seconds to wait for an answer, each of two times.
+        base_url: address of the server; None: the provider's own or the one in the environment.
+        cache_dir: folder of the answers, one request-HASH.json each, with the hash of prompt, model, address and instructions.
+        timeout: seconds to wait for an answer, in each of two tries.
 
     Raises:
-        AskingError: the library for it is not installed, the model cannot be reached or does not answer in time, refuses, or
-            twice answers nonsense; or a kept answer was damaged.
+        LanguageModelError: the library is not installed, the model cannot be reached, does not answer in time, refuses, or
+            twice gives an unusable answer; or a stored answer is damaged.
         ValueError: the text is empty, too long, or names nothing that could be in the air.
-        OSError: the answer cannot be written.
+        OSError: the answer cannot be stored.
     """
-    check(prompt)
+    check_length(prompt)
     prompt = prompt.strip()
-    kept = cache_dir / f"request-{content_key(prompt, model, base_url, INSTRUCTIONS)}.json"
-    if kept.is_file():
-        request = _kept(kept)
+    path = cache_dir / f"request-{content_key(prompt, model, base_url, INSTRUCTIONS)}.json"
+    if path.is_file():
+        request = _stored(path)
     else:
         request = _asked(prompt, model, base_url, timeout)
-        _keep(kept, {"prompt": prompt, "model": model, "request": json.loads(request.to_json())})
+        answer = {"prompt": prompt, "model": model, "request": json.loads(request.to_json())}
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(answer, indent=2, ensure_ascii=False) + "\n", "utf-8")
     if request.base is None:
         raise ValueError(f"{prompt!r} {NO_WEATHER} (so says {model})")
     return request
 
 
 def check_model(model: str, base_url: str | None) -> None:
-    """Refuse what cannot be the name of a model or the address of a server.
+    """Check the name of a model and the address of its server, without asking it.
+
+    Args:
+        model: PROVIDER:NAME.
+        base_url: address of the server; None: the provider's own or the one in the environment.
 
     Raises:
-        AskingError: the name is not PROVIDER:NAME, or the address does not begin with http:// or https:// and a host.
+        LanguageModelError: the name is not PROVIDER:NAME, or the address does not begin with http:// or https:// and a host.
     """
     if not MODEL.fullmatch(model):
-        raise AskingError(f"a language model must be named {HOW_TO_NAME}, found {model!r}")
+        raise LanguageModelError(f"a language model must be named {HOW_TO_NAME}, found {model!r}")
     if base_url is not None and not re.match(r"https?://[^/]", base_url):
-        raise AskingError(f"the address of {model} must begin with http:// or https:// and a host, found {base_url!r}")
+        raise LanguageModelError(f"the address of {model} must begin with http:// or https:// and a host, found {base_url!r}")
 
 
 def _asked(prompt: str, model: str, base_url: str | None, timeout: float) -> Request:
@@ -159,14 +171,14 @@ def _asked(prompt: str, model: str, base_url: str | None, timeout: float) -> Req
         ]
     try:
         return Request.from_json(_object_in(connection.answer(messages)))
-    except AskingError:
+    except LanguageModelError:
         raise
     except ValueError as fault:
-        raise AskingError(f"{model} was asked twice and gave no usable answer: {fault}; try another model") from fault
+        raise LanguageModelError(f"{model} was asked twice and gave no usable answer: {fault}; try another model") from fault
 
 
 def _object_in(answer: str) -> str:
-    """The JSON object in an answer, without the thoughts before and the fences around it."""
+    """The JSON object in an answer, without reasoning before it and code fences around it."""
     answer = re.sub(r"<think>.*?</think>", "", answer, flags=re.DOTALL)
     for brace in re.finditer(r"\{", answer):
         try:
@@ -179,7 +191,7 @@ def _object_in(answer: str) -> str:
 
 @dataclass(frozen=True)
 class Connection:
-    """A provider's client that answers messages, or says in one sentence why it does not."""
+    """A provider's client for one model, with errors as single sentences."""
 
     client: Any
     model: str
@@ -189,6 +201,11 @@ class Connection:
 
     @staticmethod
     def open(model: str, base_url: str | None, timeout: float) -> Connection:
+        """Make the client of a model; arguments as for `ask`.
+
+        Raises:
+            LanguageModelError: the name or the address cannot be used, or a library or a key is missing.
+        """
         check_model(model, base_url)
         provider, _, name = model.partition(":")
         try:
@@ -196,35 +213,38 @@ class Connection:
             from any_llm.exceptions import AnyLLMError, MissingApiKeyError, UnsupportedProviderError
         except ImportError as error:
             version = "" if sys.version_info >= (3, 11) else ", on Python 3.11 or later"
-            raise AskingError(
+            raise LanguageModelError(
                 f"asking {model} needs the library any-llm{version}: pip install 'pgsd-nerfstudio[llm]'"
             ) from error
         try:
             client = AnyLLM.create(provider, api_base=base_url, unified_exceptions=True, max_retries=RETRIES)
         except UnsupportedProviderError as error:
-            raise AskingError(f"there is no provider {provider!r}; name the model {HOW_TO_NAME}") from error
+            raise LanguageModelError(f"there is no provider {provider!r}; name the model {HOW_TO_NAME}") from error
         except MissingApiKeyError as error:
             key = f"a key in the environment: export {error.env_var_name}=..."
             keyless = "; a server of your own that wants none is asked as vllm:NAME" if base_url else ""
-            raise AskingError(f"asking {model} needs {key}{keyless}") from error
+            raise LanguageModelError(f"asking {model} needs {key}{keyless}") from error
         except ImportError as error:
-            raise AskingError(f"asking {model} needs one more library: pip install 'any-llm-sdk[{provider}]'") from error
+            raise LanguageModelError(f"asking {model} needs one more library: pip install 'any-llm-sdk[{provider}]'") from error
         except AnyLLMError as error:
-            raise AskingError(f"{model} cannot be asked: {_line(error)}") from error
+            raise LanguageModelError(f"{model} cannot be asked: {_line(error)}") from error
         return Connection(client, model, name, base_url, timeout)
 
     def answer(self, messages: list[dict[str, str]]) -> str:
-        """What the model says next.
+        """The model's next message; empty if it has no text.
+
+        Args:
+            messages: the conversation so far, each with a "role" and a "content".
 
         Raises:
-            AskingError: it says nothing.
+            LanguageModelError: the model cannot be reached, does not answer in time, or answers with an error.
         """
         from any_llm.exceptions import AnyLLMError
 
         try:
             completion = self.client.completion(model=self.name, messages=messages, timeout=self.timeout)
         except AnyLLMError as error:
-            raise AskingError(self._why(error)) from error
+            raise LanguageModelError(self._why(error)) from error
         choices = completion.choices
         return (choices[0].message.content or "") if choices else ""
 
@@ -249,7 +269,7 @@ class Connection:
 
     @property
     def _place(self) -> str:
-        """Where the question goes, without a password that may stand in the address."""
+        """Provider and host of the server, without a password that may be part of the address."""
         address = urlsplit(str(getattr(self.client.client, "base_url", "") or self.base_url or ""))
         return f"{self.model.partition(':')[0]} at {address.hostname}{f':{address.port}' if address.port else ''}"
 
@@ -265,19 +285,8 @@ def _line(error: BaseException) -> str:
     return words if len(words) <= 200 else f"{words[:197]}..."
 
 
-def _kept(path: Path) -> Request:
+def _stored(path: Path) -> Request:
     try:
         return Request.from_json(json.dumps(json.loads(path.read_text("utf-8"))["request"]))
     except (ValueError, KeyError, TypeError) as error:
-        raise AskingError(f"the kept answer {path} is damaged ({_line(error)}); correct or delete it") from error
-
-
-def _keep(path: Path, answer: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        beside.write_text(json.dumps(answer, indent=2, ensure_ascii=False) + "\n", "utf-8")
-        beside.replace(path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
+        raise LanguageModelError(f"the stored answer {path} is damaged ({_line(error)}); correct or delete it") from error

@@ -1,4 +1,4 @@
-"""What is emitted and what it is made of: how much, which sizes, mass and fall speed, and what it is where it lies thick."""
+"""Particles of a weather: their number and sizes, their mass and fall speed, and the material of a thick cover."""
 
 from __future__ import annotations
 
@@ -22,30 +22,31 @@ _RANGES: dict[Kind, tuple[float, float, str, str]] = {
 }
 
 INTENSITIES = {kind: (low, high) for kind, (low, high, _, _) in _RANGES.items()}
-"""Within these an Emission takes its intensity, in its unit."""
+"""Least and greatest intensity of an Emission of each kind, in its unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Emission:
-    """How much is in the air, and in which sizes."""
+    """The number of particles in the air, and their sizes."""
 
     kind: Kind = "snowflakes"
-    """Which law the sizes follow: Gunn & Marshall (1958), Marshall & Palmer (1948), Shettle & Fenn's advection fog (1979), or
-    the blown sand of Tegen et al. (2002)."""
+    """Law of the sizes: Gunn & Marshall (1958) for snowflakes, Marshall & Palmer (1948) for raindrops, Shettle & Fenn's
+    advection fog (1979), or the blown sand of Tegen et al. (2002)."""
     intensity: float
-    """Snow and rain: precipitation in mm/h of liquid water. Fog and sand: visibility in metres, at which a black object fades
-    to 2 % of its contrast."""
+    """Snow and rain: precipitation in mm/h of liquid water. Fog and sand: visibility in metres, the distance at which a black
+    object has 2 % of its contrast left."""
     smallest: float = 0.001
-    """Smallest diameter that is simulated, in metres; what is smaller carries little water and is not seen."""
+    """Smallest simulated diameter in metres; smaller particles carry little water and are not seen."""
     largest: float = 0.012
-    """Largest diameter, in metres; the fits of fall speed and mass end there."""
+    """Largest diameter in metres, at which the fits of fall speed and mass end."""
     importance: float = 1.5
-    """Where not every real particle can be simulated, larger ones are preferred: chance ~ diameter ** importance."""
+    """If not every real particle can be simulated, larger ones are preferred: chance ~ diameter ** importance."""
     most: int | None = None
-    """Particles in the air at once, at most; None: no such bound. Too many parcels of fog would each be too faint to be
-    drawn."""
+    """Largest number of particles in the air at once; None: no such bound. If there were too many parcels of fog, each would be
+    too faint to be drawn."""
     share: float = 1.0
-    """Fog and sand: part of the extinction that the simulated sizes cause. The rest is dust too fine to be seen as grains."""
+    """Fog and sand: part of the extinction that the simulated sizes cause. The rest is dust that is too fine to be seen as
+    grains."""
 
     def __post_init__(self) -> None:
         low, high, unit, hint = _RANGES[self.kind]
@@ -64,7 +65,7 @@ class Emission:
 
     @property
     def precipitates(self) -> bool:
-        """Whether the intensity is a rate of water; else it is a visibility."""
+        """Whether the intensity is a rate of precipitation; otherwise it is a visibility."""
         return self.kind in ("snowflakes", "raindrops")
 
 
@@ -75,35 +76,38 @@ class Material:
     mass_milligram: float
     """Mass of a particle of 1 mm diameter, in milligrams."""
     mass_exponent: float
+    """Exponent of the diameter in the mass."""
     speed_law: Literal["power", "rain", "fog", "sand"] = "power"
-    """A power law of the diameter, or one of physics.fall_speeds."""
+    """A power law of the diameter, or one of physics.laws.fall_speeds."""
     speed_at_1mm: float = 1.0
     """Power law: terminal speed of a particle of 1 mm diameter, in m/s."""
     speed_exponent: float = 0.0
+    """Power law: exponent of the diameter in the speed."""
     speed_factor: float = 1.0
-    """Times the law: below 1 for what should fall more slowly than nature has it."""
+    """Factor on the law; below 1 particles fall more slowly than in nature."""
 
     def mass(self, diameter: Array) -> Array:  # [n]
-        """kg of particles with `diameter` in metres; an array or a tensor."""
+        """Mass in kg of particles with `diameter` in metres, an array or a tensor."""
         kilograms: Any = 1e-6 * self.mass_milligram * (1e3 * diameter) ** self.mass_exponent
         return kilograms
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dense:
-    """Matter that lies so thick that it moves as a whole: simulated by the material point method there, and only there."""
+    """Material of a cover so thick that it moves as a whole. Only such places are simulated by the material point method."""
 
     matter: Literal["snow", "sand"]
     cell: float = 0.10
     """Spacing of the grid in metres."""
     solid_fraction: float = 0.30
-    """Share of a cell that sliding particles must fill together before they are handed over; below it each slides alone."""
+    """Share of a cell from which sliding particles are simulated together; below it each slides alone."""
     young: float = 2e4
-    """Young's modulus in Pa: 1e4-1e5 for fresh snow (Mellor 1975), 1e5 and more for sand. Time steps shrink with its root."""
+    """Young's modulus in Pa: 1e4-1e5 for fresh snow (Mellor 1975), 1e5 and more for sand. Time steps shrink with its square
+    root."""
     friction: float = 0.35
-    """Coulomb's coefficient on the scene's surfaces."""
+    """Coulomb's coefficient on the surfaces of the scene."""
     rests_below: float = 0.05
-    """Speed in m/s below which what lies on something comes to rest."""
+    """Speed in m/s below which supported matter comes to rest."""
 
     def __post_init__(self) -> None:
         for name in ("cell", "solid_fraction", "young", "rests_below"):

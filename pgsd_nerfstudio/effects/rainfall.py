@@ -1,6 +1,7 @@
-"""Rainfall: drops of 0.5 to 5 mm that streak, splash and wet what they hit.
+"""Rainfall: drops of 1 to 5 mm that streak, splash and wet surfaces.
 
-Sizes: Marshall & Palmer, "The distribution of raindrops with size" (1948). Fall speeds: Beard (1976), see physics.fall_speeds.
+Sizes: Marshall & Palmer, "The distribution of raindrops with size" (1948). Fall speeds: Beard (1976), in
+physics.laws.fall_speeds.
 """
 
 from __future__ import annotations

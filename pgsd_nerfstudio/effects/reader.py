@@ -1,7 +1,7 @@
-"""Reads a request for weather from words, without a network: `read("glittering yellow sand, no wind").request`.
+"""Read a request for weather from words, without a network: `read("glittering yellow sand, no wind").request`.
 
-It knows the words of vocabulary.py and no others, and says which it used and which it did not. A language model
-(asking.py) understands more; this reader is there at once, and gives the same answer every time.
+The reader knows only the words of vocabulary.py, and reports which words it used and which it ignored. A language model
+(language_model.py) understands more; the reader needs no network and always gives the same answer.
 """
 
 from __future__ import annotations
@@ -31,62 +31,63 @@ MOTION: dict[Base, str] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """A request, and how it was found."""
+    """A request, and the words that it was read from."""
 
     request: Request
     understood: tuple[str, ...]
-    """Such as "purple = colour (0.50, 0.00, 0.50)"."""
+    """Words with their meaning, such as "purple = colour (0.50, 0.00, 0.50)"."""
     ignored: tuple[str, ...]
-    """Words that had no part in it, with a known word that an unknown one resembles."""
+    """Words that were not used; an unknown word comes with a known one that resembles it."""
 
     def __str__(self) -> str:
-        said = f"understood {'; '.join(self.understood)}"
-        return f"{said}. Ignored: {', '.join(self.ignored)}" if self.ignored else said
+        understood = f"understood {'; '.join(self.understood)}"
+        return f"{understood}. Ignored: {', '.join(self.ignored)}" if self.ignored else understood
 
 
 def read(text: str) -> Reading:
-    """What the text requests for, as far as its words are known.
+    """Read the request in a text, as far as its words are known.
 
     Raises:
-        ValueError: it is empty or longer than 400 characters, or names no weather and nothing else that could be in the air.
+        ValueError: the text is empty or longer than 400 characters, or names nothing that could be in the air.
     """
-    check(text)
-    phrases, spoken = parse(text)
-    sheet = Sheet()
+    check_length(text)
+    phrases, wanted = parse(text)
+    findings = Findings()
     for phrase in phrases:
-        sheet.take(phrase)
-    kind = sheet.choose()
+        findings.add(phrase)
+    kind = findings.choose()
     if kind is None:
         guess = next((guess for word in re.findall(r"\w{3,}", text.lower()) if (guess := _meant(word, KINDS))), None)
         raise ValueError(f"{text.strip()!r} {NO_WEATHER}{f'; was {guess!r} meant?' if guess else ''}")
-    return Reading(_request(sheet, kind, spoken), tuple(sheet.understood), tuple(sheet.ignored))
+    return Reading(_request(findings, kind, wanted), tuple(findings.understood), tuple(findings.ignored))
 
 
-def check(text: str) -> None:
-    """Refuse a text that is empty or too long to be read by anyone.
+def check_length(text: str) -> None:
+    """Check the length of a text, for the reader and for language models.
 
     Raises:
-        ValueError: it is not 1-400 characters long.
+        ValueError: the text is not 1-400 characters long.
     """
     if not 0 < len(text.strip()) <= LONGEST:
         raise ValueError(f"a text for the weather must have 1-{LONGEST} characters, found {len(text.strip())}")
 
 
 @dataclass
-class Sheet:
-    """What has been read so far."""
+class Findings:
+    """Meanings of the phrases that have been read so far."""
 
     kinds: list[tuple[str, Kind]] = field(default_factory=list)
     colours: list[Rgb] = field(default_factory=list)
     tints: list[tuple[str, float]] = field(default_factory=list)
-    """Tints without a colour: of the weather's own."""
+    """Tints without a colour, with their degree; they apply to the weather's own colour."""
     factors: dict[str, float | bool] = field(default_factory=dict)
     denied: dict[str, float | bool] = field(default_factory=dict)
+    """Values of fields that negated words ask for."""
     understood: list[str] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
 
-    def take(self, phrase: Phrase) -> None:
-        """Add what a phrase says."""
+    def add(self, phrase: Phrase) -> None:
+        """Add the meanings of the words of a phrase."""
         items = phrase.items
         if not phrase.counts:
             self.ignored.append(" ".join(item.words for item in items))
@@ -109,13 +110,13 @@ class Sheet:
                 self._paint(item.words, item.rgb, waiting)
                 waiting = []
             elif item.kind and rest and rest[0].rgb and any(other.kind for other in rest):
-                self.ignored.append(item.words)  # ash grey snow is snow
+                self.ignored.append(item.words)  # "ash grey snow" is snow
             else:
                 self._describe(item, degree, airy)
             degree = 1.0
 
     def choose(self) -> Kind | None:
-        """The kind that is meant: of those with the highest rank the first; the others are ignored."""
+        """The first kind of the highest rank; the other kinds are ignored. None if there is no kind."""
         if not self.kinds:
             return None
         chosen = max((kind for _, kind in self.kinds), key=lambda kind: kind.rank)
@@ -136,7 +137,7 @@ class Sheet:
     def _describe(self, item: Item, degree: float, airy: bool) -> None:
         wanted = dict(item.quality or {})
         if airy and wanted:
-            # A strong, a light, a fast wind: one number, of the wind.
+            # "Strong", "light" and "fast" in a phrase about wind give one factor of the wind.
             wanted = {"wind": next((wanted[name] for name in ("wind", "amount", "size", "fall_speed") if name in wanted), 1.0)}
         for name, value in wanted.items():
             if not isinstance(value, bool):
@@ -146,15 +147,15 @@ class Sheet:
         if item.kind:
             self.kinds.append((item.words, item.kind))
         _combine(self.factors, wanted)
-        said = [*map(_said, wanted.items())]
+        meanings = [*map(_said, wanted.items())]
         if item.tint and not item.quality:
             self.tints.append((item.tint, degree))
-            said.append("tint of its own colour")
-        if said:
-            self.understood.append(f"{item.words} = {', '.join(said)}")
+            meanings.append("tint of its own colour")
+        if meanings:
+            self.understood.append(f"{item.words} = {', '.join(meanings)}")
 
     def _deny(self, item: Item) -> None:
-        """What is not wanted; of "not heavy" nobody knows the contrary."""
+        """Add a negated word. Some qualities have a clear opposite; "not heavy" has none and is ignored."""
         quality = item.quality or {}
         denied: dict[str, float | bool] = {name: 0.0 for name in ("glitter", "tumbling") if name in quality}
         if item.wind or (quality.get("wind", 0) > 1 and not item.kind):
@@ -167,7 +168,7 @@ class Sheet:
 
 
 def _combine(factors: dict[str, float | bool], more: dict[str, float | bool]) -> None:
-    """Factors multiply, of glitter the greater counts, of yes and no the last."""
+    """Add `more` to `factors`: factors multiply, the greater glitter counts, the last truth value counts."""
     for name, value in more.items():
         if isinstance(value, bool) or name not in factors:
             factors[name] = value
@@ -176,53 +177,55 @@ def _combine(factors: dict[str, float | bool], more: dict[str, float | bool]) ->
 
 
 def _said(factor: tuple[str, float | bool]) -> str:
+    """A factor or a truth value in words."""
     name, value = factor
     return f"{name.replace('_', ' ')} {value:.2g}" if not isinstance(value, bool) else name if value else f"{name} not"
 
 
 def _leads_to_colour(rest: list[Item]) -> bool:
+    """Whether a colour follows, after tints and degrees only."""
     following = next((item for item in rest if not (item.tint or item.degree)), None)
     return following is not None and following.rgb is not None
 
 
 def _meant(word: str, known: list[str] | dict[str, Kind]) -> str | None:
-    """A known word that an unknown one resembles."""
+    """A known word that an unknown word resembles; None for a known word."""
     close = [] if word in known else difflib.get_close_matches(word, known, n=1, cutoff=0.8)
     return close[0] if close else None
 
 
-def _request(sheet: Sheet, kind: Kind, spoken: str) -> Request:
-    rgb = mixed(sheet.colours) if sheet.colours else kind.rgb
-    for tint, degree in sheet.tints:
+def _request(findings: Findings, kind: Kind, wanted: str) -> Request:
+    rgb = mixed(findings.colours) if findings.colours else kind.rgb
+    for tint, degree in findings.tints:
         rgb = tinted(rgb or NOMINAL[kind.base], tint, degree)
     values = dict(kind.factors)
-    _combine(values, sheet.factors)
-    values |= sheet.denied
+    _combine(values, findings.factors)
+    values |= findings.denied
     for name, (least, greatest) in LIMITS.items():
         if name in values:
             bounded = min(max(values[name], least), greatest)
             if bounded != values[name]:
-                sheet.understood.append(f"{_said((name, values[name]))} is beyond the limit: {bounded:g}")
+                findings.understood.append(f"{_said((name, values[name]))} is beyond the limit: {bounded:g}")
             values[name] = round(bounded, 3)
     return Request(
         base=kind.base,
         rgb=rgb,
         landed_rgb=kind.landed_rgb or rgb,
-        prompt=_sentence(spoken, kind.base, values.get("accumulates")),
+        prompt=_sentence(wanted, kind.base, values.get("accumulates")),
         **values,  # pyright: ignore[reportArgumentType]
     )
 
 
-def _sentence(spoken: str, base: Base, accumulates: float | bool | None) -> str:
-    """What a video model is told, in the manner of the built-in effects."""
+def _sentence(wanted: str, base: Base, accumulates: float | bool | None) -> str:
+    """The prompt for a video model, in the style of the built-in effects, from the text without its negated words."""
     end = "" if base == "fog" else ", wetting the surfaces" if base == "rainfall" else ", accumulating on surfaces"
     if accumulates is not None:
         end = ", accumulating on surfaces" if accumulates else ""
-    last = spoken.rpartition(" ")[2]
-    links = set(spoken.split()) & (LINKS - {"and", "of"} | PLACES)
-    # "Purple snow" needs a verb; "a snow storm" has one in it; anything longer is a clause by itself.
-    if not any(form in KINDS for form in forms(last)) or last.endswith("ing") or links or re.search(r"[,.;:!?()]", spoken):
-        return f"In {{scene}}: {spoken}{end}. Photorealistic, high detail"
-    moves = last in QUALITIES or last.endswith(("storm", "fall")) or set(spoken.split()) & {"falling", "raining", "snowing"}
+    last = wanted.rpartition(" ")[2]
+    links = set(wanted.split()) & (LINKS - {"and", "of"} | PLACES)
+    # "Purple snow" needs a verb, "a snow storm" implies one, and a longer text is a clause by itself.
+    if not any(form in KINDS for form in forms(last)) or last.endswith("ing") or links or re.search(r"[,.;:!?()]", wanted):
+        return f"In {{scene}}: {wanted}{end}. Photorealistic, high detail"
+    moves = last in QUALITIES or last.endswith(("storm", "fall")) or set(wanted.split()) & {"falling", "raining", "snowing"}
     verb = "in" if moves else MOTION[base]
-    return f"{spoken[:1].upper()}{spoken[1:]} {verb} {{scene}}{end}. Photorealistic, high detail"
+    return f"{wanted[:1].upper()}{wanted[1:]} {verb} {{scene}}{end}. Photorealistic, high detail"

@@ -1,7 +1,7 @@
-"""What a free text asks of the weather, as plain numbers: the one form in which a reader or a language model may answer.
+"""A request for weather as plain numbers: the form in which the reader or a language model answers a free text.
 
-A request says how to turn the knobs of a base effect. It knows nothing of how an effect is built; `application` does. The
-limits keep every answer within what was simulated and looked at, so that a strange answer gives strange weather, not a crash.
+A request changes a base effect by factors and colours; `application` applies them to the Effect. The limits keep every answer
+within the range that was simulated and looked at, so that a strange answer gives strange weather and not a crash.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Rgb = tuple[Share, Share, Share]
 
 
-# Strict: a number in quotes or a yes for a colour is a misunderstanding, not a spelling.
+# Strict, since a number in quotes or a truth value for a colour shows that the field was misunderstood.
 STRICT = ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Request:
-    """How a text wants the weather. Factors multiply what the base effect has; 1 keeps it."""
+    """The weather that a text asks for. Factors multiply the numbers of the base effect; 1 keeps them."""
 
     base: Base | None
-    """The effect that moves most like it: snowfall (sways down slowly, lands, gathers), rainfall (falls fast, wets), fog (hangs
-    and drifts), sandstorm (flies sideways with the wind). null: the text names nothing that could be in the air."""
+    """The effect that moves most like it: snowfall (sways down slowly, lands, accumulates), rainfall (falls fast, wets), fog
+    (hangs and drifts), sandstorm (moves sideways with the wind). null: the text names nothing that could be in the air."""
     rgb: Rgb | None = None
-    """Colour of what flies, sRGB. null keeps the base's."""
+    """Colour of the particles in the air, sRGB. null keeps the base's."""
     landed_rgb: Rgb | None = None
-    """Colour of what has landed, sRGB. null: that of what flies."""
+    """Colour of the particles that have landed, sRGB. null: the colour of those in the air."""
     size: Annotated[float, Field(ge=0.2, le=5)] = 1.0
     """Factor on the diameter of the particles (the base's snowflakes have 1.5-12 mm)."""
     amount: Annotated[float, Field(ge=0.1, le=5)] = 1.0
-    """Factor on how much falls or how dense it is: 0.4 is light, 2 heavy, 4 a blizzard or downpour."""
+    """Factor on the precipitation or the density: 0.4 is light, 2 heavy, 4 a blizzard or downpour."""
     opacity: Annotated[float, Field(ge=0.1, le=2)] = 1.0
     """Factor on the opacity of each particle."""
     glitter: Share = 0.0
@@ -47,20 +47,20 @@ class Request:
     wind: Annotated[float, Field(ge=0, le=3)] = 1.0
     """Factor on the wind and its gusts; 0 is still air."""
     tumbling: Annotated[float, Field(ge=0, le=5)] = 1.0
-    """Factor on the swaying and turning that each particle does by itself; leaves and confetti have about 3."""
+    """Factor on the swaying and turning of each particle by itself; leaves and confetti have about 3."""
     accumulates: bool | None = None
-    """Whether what lands stays and gathers. null keeps what the base does."""
+    """Whether particles that land stay and form a cover. null keeps what the base does."""
     prompt: Annotated[str, Field(max_length=600, pattern=r"^[^{}\n]*\{scene\}[^{}\n]*$")]
-    """One English sentence that tells a video model what is seen, with {scene} where the description of the scene belongs,
+    """One English sentence that describes the video for a video model, with {scene} in place of the description of the scene,
     such as: Purple snowflakes are falling in {scene}, accumulating on surfaces. Photorealistic, high detail"""
 
     @staticmethod
     def from_json(text: str) -> Request:
-        """The request that a JSON object says.
+        """Read a request from a JSON object.
 
         Raises:
-            ValueError: it is not JSON, or has unknown fields, wrong types or numbers out of range; the message names each such
-                field, what is allowed and what was found.
+            ValueError: the text is not JSON, or has unknown fields, wrong types or numbers out of range; the message names each
+                such field, what is allowed and what was found.
         """
         try:
             return ADAPTER.validate_json(text)
@@ -75,11 +75,11 @@ class Request:
 
 ADAPTER = TypeAdapter(Request)
 SCHEMA: dict[str, Any] = ADAPTER.json_schema()
-"""JSON schema of a request, descriptions included: what a language model is told."""
+"""JSON schema of a request with its descriptions, which a language model is given."""
 LIMITS: dict[str, tuple[float, float]] = {
     name: (field["minimum"], field["maximum"]) for name, field in SCHEMA["properties"].items() if "minimum" in field
 }
-"""Least and greatest value of each number that is no colour."""
+"""Least and greatest value of each factor."""
 
 
 def _fault(fault: Any) -> str:
@@ -99,7 +99,7 @@ def _fault(fault: Any) -> str:
 
 
 def _allowed(field: dict[str, Any]) -> str:
-    """In words, what the schema of a field allows."""
+    """The values that the schema of a field allows, in words."""
     if "anyOf" in field:
         return " or ".join(_allowed(choice) for choice in field["anyOf"])
     if "enum" in field:

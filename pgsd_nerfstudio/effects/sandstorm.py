@@ -1,4 +1,4 @@
-"""Sandstorm: grains of 0.1 to 1 mm blown by a strong wind, that settle as a thin film and pile where the wind leaves them.
+"""Sandstorm: grains of 0.1 to 1 mm that a strong wind carries, and that settle as a thin cover.
 
 Sizes: the sand populations of desert soils of Tegen et al. (2002). Fall speeds: Ferguson & Church (2004).
 """

@@ -1,4 +1,4 @@
-"""Snowfall: aggregates of dendrites, as they fall near 0 °C.
+"""Snowfall: aggregates of dendrites, which fall near 0 °C.
 
 Sizes: Gunn & Marshall, "The distribution with size of aggregate snowflakes" (1958): N(D) = N0 exp(-Lambda D) over the melted
 diameter D, N0 = 3.8e3 R^-0.87 per m^3 and mm, Lambda = 2.55 R^-0.48 per mm, R in mm/h of water.
@@ -50,21 +50,36 @@ SNOWFALL = register(
 
 
 def fall_speed(diameter: Float[ndarray, " n"], material: Material = AGGREGATES) -> Float[ndarray, " n"]:
-    """Terminal speed in m/s of particles with `diameter` in metres, whose law is a power."""
+    """Terminal speed in m/s by the power law of a material.
+
+    Args:
+        diameter: in metres.
+        material: its `speed_law` is "power"; by default that of Locatelli & Hobbs (1974).
+    """
     return material.speed_at_1mm * (1e3 * diameter) ** material.speed_exponent
 
 
 def mass(diameter: Float[ndarray, " n"], material: Material = AGGREGATES) -> Float[ndarray, " n"]:
-    """Mass in kg of particles with `diameter` in metres."""
+    """Mass in kg by the power law of a material.
+
+    Args:
+        diameter: in metres.
+        material: by default that of Locatelli & Hobbs (1974).
+    """
     return material.mass(diameter)
 
 
 def number_density(melted: Float[ndarray, " n"], intensity: float) -> Float[ndarray, " n"]:
-    """Flakes per m^3 of air and metre of melted diameter (in metres), at `intensity` mm/h (Gunn & Marshall 1958)."""
+    """Flakes per m^3 of air and metre of melted diameter (Gunn & Marshall 1958).
+
+    Args:
+        melted: diameters of the melted flakes in metres.
+        intensity: precipitation in mm/h of water.
+    """
     slope = 2.55 * intensity**-0.48  # 1/mm
     return 1e3 * 3.8e3 * intensity**-0.87 * np.exp(-slope * 1e3 * melted)
 
 
 def melted_diameter(mass_kg: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-    """Diameter in metres of the water drop of that mass."""
+    """Diameter in metres of a water drop with the mass `mass_kg`."""
     return (6.0 * mass_kg / (math.pi * 1000.0)) ** (1 / 3)

@@ -1,4 +1,4 @@
-"""What happens where a particle meets a surface: it stays, vanishes, wets, splashes or glides along."""
+"""The response of surfaces to contact: a particle stays, vanishes, wets the surface, splashes or glides along it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from typing import Literal
 
 @dataclass(frozen=True, kw_only=True)
 class Splash:
-    """The crown of a drop that hits: a few droplets that live until they fall back.
+    """The crown of an impact: a few droplets that live until they fall back.
 
-    A part of the impact's kinetic energy leaves with them; how many there are follows from the energy too, so that drizzle does
-    not splash and large drops do. (Ejected droplets of a tenth to a third of the drop: Yarin, "Drop impact dynamics", 2006.)
+    The droplets carry off a part of the kinetic energy of the impact. Their number follows from the energy too, so that large
+    drops splash and drizzle does not. Ejected droplets have a tenth to a third of the drop's diameter (Yarin, "Drop impact
+    dynamics", 2006).
     """
 
     joule_per_droplet: float = 1.2e-5
-    """Kinetic energy of an impact for which one droplet is made; a drop of 2 mm brings 9e-5 J."""
+    """Kinetic energy in J of an impact for which one droplet is made; a drop of 2 mm has 9e-5 J."""
     most: int = 4
-    """Droplets of one impact, at most."""
+    """Largest number of droplets of one impact."""
     diameter: float = 0.22
-    """Diameter of a droplet, relative to that of the drop."""
+    """Diameter of a droplet relative to that of the drop."""
     energy: float = 0.04
-    """Share of the kinetic energy that they carry off together."""
+    """Share of the kinetic energy that the droplets carry off together."""
 
     def __post_init__(self) -> None:
         if not (self.joule_per_droplet > 0 and self.most >= 0 and 0 < self.diameter < 1 and 0 <= self.energy <= 1):
@@ -38,41 +39,41 @@ class Splash:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceResponse:
-    """What happens on contact."""
+    """What happens when a particle meets a surface."""
 
     landing: Literal["stays", "vanishes", "wets", "glides"] = "stays"
-    """Particles stay and make a cover (snow, sand), are gone, leave their water (rain), or flow along the surface (fog)."""
+    """stays: particles make a cover (snow, sand). vanishes: they are gone. wets: they leave their water (rain). glides: they
+    flow along the surface (fog)."""
     holds_degrees: float = 50.0
     """Up to this slope every particle stays."""
     slips_degrees: float = 80.0
-    """From this slope none stays, it slides down; in between the chance falls linearly."""
+    """From this slope every particle slides down; between the two slopes the chance to stay falls linearly."""
     friction: float = 0.30
-    """Coulomb's coefficient of what slides by itself."""
+    """Coulomb's coefficient of a particle that slides by itself."""
     settle: float = 0.006
-    """Height at which a landed particle rests above the surface, so that it is not drawn into it."""
+    """Height in metres of a collided particle above the surface, so that it is not drawn inside it."""
     probe: float = 0.12
-    """Largest radius over which a landed particle may spread; less where the surface ends or bends before."""
+    """Largest radius in metres over which a collided particle may spread; it is less if the surface ends or bends before."""
     accumulates: bool = True
-    """Whether the cover raises the surface for what lands later."""
+    """Whether the cover raises the surface for particles that land later."""
     repose_degrees: float = 45.0
     """Angle of repose: the steepest slope of a cover thicker than `film`."""
     film: float = 0.005
-    """Thickness in metres that clings to any slope on which it was put."""
+    """Thickness in metres that stays on any slope, however steep."""
     accumulation_speedup: float = 800.0
-    """Time lapse of the cover: a landed particle stands for this many times the water that it and the real particles it
-    represents bring. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours."""
+    """Time lapse of the cover: a collided particle stands for this many times its own water and that of the real particles it
+    represents. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours."""
     layer_density: float = 100.0
-    """Density of the fresh layer in kg/m^3; 100 makes 1 cm of snow from 1 mm of water."""
+    """Density of fresh cover in kg/m^3; 100 makes 1 cm of snow from 1 mm of water."""
     layer_thickness: float = 0.010
-    """Thickness in metres of what one particle leaves; its area follows from its volume, so that the cover does not depend on
-    how many particles were affordable."""
+    """Thickness in metres of the cover of one particle. Its area follows from its volume, so that the cover does not depend on
+    the number of simulated particles."""
     hides: float = 0.004
-    """Thickness in metres of a layer that hides 63 % of what it lies on."""
+    """Thickness in metres of a cover that hides 63 % of the surface below it."""
     darkens: float = 0.03
-    """Water in mm (kg/m^2) that makes 63 % of a dry surface look wet; pores take up about 0.1 mm until nothing changes any
-    more."""
+    """Water in mm (kg/m^2) that makes 63 % of a dry surface look wet. Pores take up about 0.1 mm, and more changes nothing."""
     splash: Splash | None = None
-    """Droplets of an impact; None: none."""
+    """Droplets of an impact; None: there are none."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.holds_degrees <= self.slips_degrees <= 180.0:

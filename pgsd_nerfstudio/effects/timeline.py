@@ -1,4 +1,4 @@
-"""When a weather comes and goes."""
+"""The timeline of a weather: how it arrives and when it ends."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class Timeline:
     """Course of a weather over time; seconds count from the first frame."""
 
     onset: float = 0.0
-    """Seconds within which it comes, from a clear start to all of it; 0: all of it is there in the first frame."""
+    """Seconds in which the weather grows from a clear start to its full strength; 0: the first frame has full weather."""
     arrives: Literal["everywhere", "as a front"] = "everywhere"
-    """everywhere: denser by and by. as a front: a wall that the wind carries across the scene within the onset."""
+    """everywhere: the weather grows evenly. as a front: the wind carries a wall across the scene within the onset."""
     ends: float = math.inf
-    """Second after which nothing new comes; what is in the air still comes down, and what is wet dries."""
+    """Second after which no new particles are emitted. Those in the air still fall, and wet surfaces dry."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.onset < math.inf:
@@ -30,11 +30,11 @@ class Timeline:
         return self.onset > 0
 
     def share(self, seconds: float) -> float:
-        """How much of it has come by then, 0..1: rises linearly within the onset, then stays (also after the end)."""
+        """Share of the full weather at a second, 0..1. It rises linearly within the onset and then stays, after the end too."""
         return min(max(seconds / self.onset, 0.0), 1.0) if self.onset > 0 else 1.0
 
     def fallen(self, seconds: float) -> float:
-        """Seconds of full weather that have come by then: the integral of its share until it ends."""
+        """Seconds of full weather up to a second: the integral of the share until the weather ends."""
         until = min(max(seconds, 0.0), self.ends)
         ramp = min(until, self.onset)
         return (0.5 * ramp * ramp / self.onset if self.onset > 0 else 0.0) + max(until - self.onset, 0.0)

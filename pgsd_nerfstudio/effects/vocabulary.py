@@ -1,8 +1,8 @@
-"""Words for weather and what they stand for: kinds of things in the air, qualities, colours.
+"""Words for weather and their meanings: kinds of particles, qualities, colours.
 
-Colours are the names of CSS and, for the rest, of the XKCD survey (matplotlib has both); how far "dark" or "pale" changes a
-colour was fitted to the pairs in that survey ("pale blue" against "blue"). The other numbers are estimates: relative to the
-effect's own, and for what is no weather by how it falls (a petal at about 0.8 m/s, ash at half a metre, pollen hardly at all).
+Colours have the names of CSS and, after these, of the XKCD survey (matplotlib has both). The strengths of "dark", "pale" and
+the like were fitted to pairs of that survey ("pale blue" and "blue"). The other numbers are estimates relative to the effect's
+own. For kinds that are no weather they follow the fall speed: a petal falls at about 0.8 m/s, ash at 0.5 m/s, pollen hardly.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ def _spread(*rows: tuple[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Kind:
-    """Something that can be in the air."""
+    """A kind of particle with its base effect, its colours and its factors."""
 
     base: Base
     rgb: Rgb | None = None
     landed_rgb: Rgb | None = None
     factors: dict[str, float | bool] = field(default_factory=dict)
     rank: int = 2
-    """Of several kinds in one text the highest is meant: 3 petals, ash; 2 snow, rain; 1 snowy, shower, particles; 0 storm."""
+    """If a text names several kinds, the highest rank is meant: 3 petals, ash; 2 snow, rain; 1 snowy, shower, particles; 0
+    storm."""
 
 
 def _particle(rgb: Rgb | None = None, landed_rgb: Rgb | None = None, **factors: float | bool) -> Kind:
@@ -82,14 +83,14 @@ KINDS: dict[str, Kind] = _spread(
     ("particle, speck, glitter, sparkle, star", Kind("snowfall", factors={"fall_speed": 0.6}, rank=1)),
     ("storm, tempest, squall", Kind("rainfall", rank=0)),
 )
-"""In the singular. Some of rank 1 and 0 are qualities too: a blizzard of petals, a sand storm."""
+"""Kinds by their names in the singular. Some of rank 1 and 0 are qualities too: a blizzard of petals, a sand storm."""
 NOMINAL: dict[Base, Rgb] = {
     "snowfall": (0.95, 0.97, 1.0),
     "rainfall": (0.75, 0.8, 0.86),
     "fog": (0.86, 0.88, 0.9),
     "sandstorm": (0.8, 0.63, 0.4),
 }
-"""What "dark" or "pale" changes where the text names no colour."""
+"""Colours that "dark" or "pale" changes if the text names none."""
 
 QUALITIES: dict[str, dict[str, float | bool]] = _spread(
     ("tiny, minuscule, microscopic, minute", {"size": 0.35}),
@@ -136,9 +137,9 @@ QUALITIES: dict[str, dict[str, float | bool]] = _spread(
     ("melting, melt, vanishing, vanish, disappearing, disappear, evaporating, dissolving", {"accumulates": False}),
 )
 WINDS: dict[str, float] = _spread(("wind", 1.3), ("gust", 2.0), ("breeze", 0.8), ("draught, draft", 0.6), ("gale", 3.0))
-"""Nouns that what stands before them describes: a strong wind is more wind, not more snow."""
+"""Nouns for wind with their factors. Words before them describe the wind: a strong wind is more wind, not more snow."""
 
-# Towards what, and how far on the way there.
+# Target of each tint, and the part of the way to it.
 TINTS: dict[str, tuple[str, float]] = _spread(
     ("light", ("white", 0.3)),
     ("pale, whitish", ("white", 0.45)),
@@ -154,7 +155,7 @@ DEGREES: dict[str, float] = _spread(
     ("slightly, somewhat, fairly, rather, a bit", 0.5),
 )
 SHADES = {"snow white": "white", "jet black": "black", "pitch black": "black", "silvery": "silver", "golden": "gold"}
-# Names of the survey that in a sentence are more often a place than a colour, or not fit to print.
+# Names of the survey that in a sentence mean a place more often than a colour, or that are rude.
 SCENERY = _spread(
     ("sky, sea, ocean, grass, forest, fern, moss, desert, earth, stone, mud, clay, dirt, swamp, brick, cement, steel", None),
     ("leather, denim, seaweed, lichen, marine, royal, barney, adobe, spruce, pine, bruise, poo, poop, shit, puke", None),
@@ -163,11 +164,11 @@ SCENERY = _spread(
 
 
 def colour(name: str) -> Rgb | None:
-    """The colour of that name, as CSS has it, else as most people in the survey do."""
+    """The colour of a name, sRGB in 0..1, by CSS, else by the XKCD survey; None if the name is no colour here."""
     last = name.rpartition(" ")[2]
     name = SHADES.get(name, name)
     joined = name.replace(" ", "")
-    # Where what follows is a thing in the air, the words before describe it: "white smoke", "dark sand".
+    # Before a kind of particle these words describe the kind: "white smoke", "dark sand".
     if (last in KINDS and last != name) or name in KINDS or name.startswith(("heavy ", "strong ")):
         return None
     if joined in CSS4_COLORS:
@@ -178,12 +179,18 @@ def colour(name: str) -> Rgb | None:
 
 
 def tinted(rgb: Rgb, tint: str, degree: float = 1.0) -> Rgb:
-    """The colour that is called "dark", "pale" ... of `rgb`; a degree above 1 is "very", below 1 "slightly"."""
+    """The "dark", "pale" ... variant of a colour.
+
+    Args:
+        rgb: sRGB in 0..1.
+        tint: a word of TINTS.
+        degree: strength of the change; above 1 for "very", below 1 for "slightly".
+    """
     target, share = TINTS[tint]
     share = 1 - (1 - share) ** degree
     if target == "vivid":
         hue, saturation, _ = colorsys.rgb_to_hsv(*rgb)
-        # Grey has no hue that could glow: it only gets lighter.
+        # Grey has no hue, so it only gets lighter.
         towards = colorsys.hsv_to_rgb(hue, 1.0 if saturation > 0.05 else saturation, 1.0)
     else:
         luma = 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]
@@ -193,7 +200,7 @@ def tinted(rgb: Rgb, tint: str, degree: float = 1.0) -> Rgb:
 
 
 def mixed(colours: Sequence[Rgb]) -> Rgb:
-    """What particles of these colours look like together from afar: the mean of their light (IEC 61966-2-1 for sRGB)."""
+    """The colour of a mixture of particles seen from afar: the mean of their linear light (IEC 61966-2-1 for sRGB)."""
     if len(colours) == 1:
         return colours[0]
     red, green, blue = (_encoded(sum(map(_light, parts)) / len(parts)) for parts in zip(*colours, strict=True))
@@ -212,7 +219,7 @@ ENDINGS = {"ies": ("y",), "es": ("",), "s": ("",), "ily": ("y",), "ly": ("", "le
 
 
 def forms(word: str) -> Iterator[str]:
-    """The word, and what it may be a plural, an adverb or a shade of."""
+    """The word itself, and the words that it may be a plural, an adverb or a shade of."""
     yield word
     for ending, others in ENDINGS.items():
         if word.endswith(ending) and len(word) > len(ending) + 2:
