@@ -188,7 +188,7 @@ class Air:
         return self._wrapped(new, frame * self.step)
 
     def _wrapped(self, bodies: Bodies, time: float) -> Bodies:
-        """Particles wrapped into the domain, which is periodic in x and y, without those that cannot be there or are unneeded."""
+        """Particles wrapped into the domain, periodic in x and y. Those that cannot be there or are unneeded drop out."""
         inside = (bodies.positions[:, 2] >= self.domain.lower[2]) & (bodies.positions[:, 2] <= self.domain.upper[2])
         wrapped = bodies.positions.astype(np.float64)
         self._wrap(wrapped)

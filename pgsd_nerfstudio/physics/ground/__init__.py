@@ -1,1 +1,1 @@
-"""What happens on surfaces: landing, sliding, cover, wetness, matter so thick that it moves as a whole."""
+"""Physics on surfaces: landing, sliding, cover, wetness and dense matter."""

@@ -1,9 +1,9 @@
-"""A layered height field of a scene: above every square of the plan, the heights of all surfaces that look up.
+"""A layered height field of a scene: above every square of the plan, the heights of all surfaces that face up.
 
-A table over a floor has two levels there. Rays fall through the mesh from above, again and again below each hit; what lies
-closer beneath another surface than `gap` belongs to the same thing. Each level knows the level in each of the eight squares
-around it that continues its sheet, and where its sheet ends: at a drop (the edge of a table), at a wall, or with the domain.
-Eight squares and not four, because a heap that only feels four becomes a pyramid.
+A square with a table over a floor has two levels. Rays are cast down through the mesh, again below each hit; a surface closer
+beneath another one than `gap` belongs to the same object and makes no level. Each level knows the level in each of the eight
+squares around it that continues its sheet, and where its sheet ends: at a drop (the edge of a table), at a wall, or at the
+border of the domain. It has eight neighbours rather than four because heaps with four neighbours become pyramids.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 MAX_COLUMNS = 400_000
-STEEPEST = math.tan(math.radians(75.0))  # rise per edge of a square up to which two neighbours belong to one sheet
-BELOW_UNDERSIDE = 1e-3  # m below a surface that looks down, from where the next ray starts
-WALL, DROP, BORDER = -1, -2, -3  # in place of a neighbour
+STEEPEST = math.tan(math.radians(75.0))  # largest rise per edge of a square between neighbours of one sheet
+BELOW_UNDERSIDE = 1e-3  # m below a surface that faces down, at which the next ray starts
+WALL, DROP, BORDER = -1, -2, -3  # ends of a sheet, in place of a neighbour
 NOWHERE = -1  # in place of the level beyond an end
 AROUND = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)])
-# The diagonals beside direction k < 4 are 4 + k and 4 + (k + 3) % 4; opposite to k is (k + 2) % 4.
+# The diagonals beside direction k < 4 are 4 + k and 4 + (k + 3) % 4; the direction opposite to k is (k + 2) % 4.
 
 
 class Columns(NamedTuple):
@@ -43,13 +43,20 @@ class Columns(NamedTuple):
     base: Float[ndarray, " l"]
     """Height of each level, metres."""
     neighbours: Int[ndarray, "l 8"]
-    """Level that continues the sheet in the directions of AROUND, or WALL, DROP, BORDER."""
+    """Level that continues the sheet in each direction of AROUND, or WALL, DROP, BORDER."""
     beyond: Int[ndarray, "l 8"]
-    """At a DROP the level onto which things fall, at a WALL the level on top of it; NOWHERE if there is none."""
+    """At a DROP the level below it, at a WALL the level on top of it; NOWHERE if there is none."""
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, cell: float, gap: float) -> Columns:
-        """Of a surface, within the plan of a domain; squares grow where there would be more than 400,000."""
+        """The columns of a surface.
+
+        Args:
+            surface: the mesh, in metres.
+            domain: its plan and heights bound the columns.
+            cell: edge of a square in metres; it grows where there would be more than 400,000 squares.
+            gap: metres; a surface closer beneath another one makes no level.
+        """
         cell = max(cell, math.sqrt(domain.area / MAX_COLUMNS))
         nx, ny = (max(1, math.ceil(edge / cell)) for edge in domain.size[:2])
         lower = np.asarray(domain.lower[:2], np.float64)
@@ -65,15 +72,20 @@ class Columns(NamedTuple):
 
     @property
     def centres(self) -> Float[ndarray, "l 3"]:
-        """Middle of the square of each level, at its height."""
+        """Middle of the square of each level, at the level's height, in metres."""
         at = np.stack(np.unravel_index(self.column, self.shape), 1)
         return np.column_stack([self.lower + self.cell * (at + 0.5), self.base])
 
     def find(self, points: Float[ndarray, "n 3"], heights: Float[ndarray, " l"], tolerance: float) -> Int[ndarray, " n"]:
-        """Level in whose cover, or within `tolerance` metres above or below it, each point lies; -1 where there is none.
+        """The level that each point belongs to; -1 where there is none.
 
-        The nearest one of the point's own square; if that has none, of the squares around it, since at an edge its middle may
-        lie beyond the surface. Points that are no number belong to none.
+        A point belongs to the nearest level of its own square. If there is none, it belongs to the nearest level of the squares
+        around, since at an edge the middle of its square may be beyond the surface. A point with NaN belongs to no level.
+
+        Args:
+            points: m.
+            heights: thickness of the cover on each level, m.
+            tolerance: metres that a point may be below a level or above its cover.
         """
         return _find(np.ascontiguousarray(points, np.float64), self, heights, tolerance)
 
@@ -81,12 +93,12 @@ class Columns(NamedTuple):
 def _levels(
     surface: SurfaceMesh, lower: Float[ndarray, "2"], cell: float, shape: tuple[int, int], domain: Domain, gap: float
 ) -> tuple[Int[ndarray, " l"], Float[ndarray, " l"]]:
-    """Columns and heights of the surfaces that look up within the domain."""
+    """Columns and heights of the surfaces that face up within the domain."""
     columns, heights = [np.zeros(0, np.int64)], [np.zeros(0)]
     which = np.arange(shape[0] * shape[1]) if len(surface.triangles) else np.zeros(0, np.int64)
     at = lower + cell * (np.stack(np.unravel_index(which, shape), 1) + 0.5)
     origin = np.column_stack([at, np.full(len(at), domain.upper[2])])
-    while len(which):  # each time lower by 1 mm or more, until nothing is below
+    while len(which):  # rays start 1 mm or more lower each time, until they hit nothing
         down = torch.tensor([0.0, 0.0, -1.0]).expand(len(origin), 3)
         hits = surface.cast(torch.from_numpy(origin.astype(np.float32)), down)
         distance, upward = hits.distance.numpy().astype(np.float64), hits.normal.numpy()[:, 2] > 0
@@ -95,7 +107,7 @@ def _levels(
         z = origin[:, 2] - distance[hit]
         columns.append(which[upward])
         heights.append(z[upward])
-        # The underside of what was hit belongs to it; what looks down by itself is passed at once.
+        # A surface within `gap` below one that faces up is its underside; below one that faces down nothing is skipped.
         origin[:, 2] = z - np.where(upward, gap, BELOW_UNDERSIDE)
     return np.concatenate(columns), np.concatenate(heights)
 
@@ -110,8 +122,8 @@ def _link(columns, around, reach):
             i, j = x + around[k, 0], y + around[k, 1]
             if i < 0 or j < 0 or i >= nx or j >= ny:
                 continue
-            near, closest = -1, reach  # the same along diagonals, or steps would be stairs there and edges elsewhere
-            under, over = -1, -1  # the highest level below this one, the lowest above
+            near, closest = -1, reach  # diagonals have the same reach, so that a step is a drop in all directions or in none
+            under, over = -1, -1  # the highest level below this one and the lowest above
             for m in range(first[i * ny + j], first[i * ny + j + 1]):
                 apart = abs(base[m] - base[level])
                 if apart <= closest:

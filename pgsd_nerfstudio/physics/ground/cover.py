@@ -1,9 +1,10 @@
-"""The cover that landed matter makes: a thickness on the scene's surfaces, never steeper than its angle of repose.
+"""The cover of landed particles: a thickness on the scene's surfaces whose top is never steeper than its angle of repose.
 
-Thickness is counted upwards, on the levels of `columns`. What a particle leaves is spread over a disc, as its patch is drawn.
-Where the raised surface is steeper than the angle of repose, cover runs down until it is not (`toppling`); a `film` clings to
-any slope. Cover falls over edges onto what is below, and is lost where nothing is; at the border of the domain the surface is
-taken to go on as it comes, under the same cover. What lies only grows. Volume is kept to round-off: deposited = held + lost.
+Thickness is measured along z on the levels of `columns`. The layer of a particle is spread over a disc, as its patch is drawn.
+Where the top of the cover is steeper than the angle of repose, cover runs down (`toppling`); a `film` clings to any slope.
+Cover falls over edges onto the level below, and is lost where there is none. At the border of the domain the surface is taken
+to go on with the same slope, under the same cover. Cover at rest never becomes thinner. Volume is conserved to round-off:
+deposited = held + lost.
 """
 
 from __future__ import annotations
@@ -25,22 +26,22 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 @dataclass(frozen=True, kw_only=True)
 class CoverConfig:
-    """How cover lies."""
+    """Resolution and slopes of the cover."""
 
     cell: float = 0.05
     """Edge of the squares on which thickness is kept, in metres."""
     gap: float = 0.10
-    """Surfaces closer beneath another one than this, in metres, hold no cover of their own."""
+    """Metres. A surface closer beneath another one holds no cover of its own."""
     repose_degrees: float = 45.0
-    """Angle of repose: the steepest slope of what is thicker than `film`."""
+    """Angle of repose: the steepest slope of cover thicker than `film`."""
     film: float = 0.005
-    """Thickness in metres that clings to any slope on which it was put."""
+    """Thickness in metres that clings to any slope."""
     tolerance: float = 0.15
-    """How far in metres a point may lie above or below a level that it belongs to; slopes within a square need some."""
+    """Metres that a point may be below a level or above its cover and still belong to it, since squares are sloped inside."""
     slack: float = 1e-4
-    """Metres by which a step may be too high before it gives way."""
+    """Metres by which a level's top may be too high before cover runs down."""
     most_moves: int = 200
-    """Moves per level of the field that one `relax` may take."""
+    """Moves of cover that one `relax` may make, per level."""
 
     def __post_init__(self) -> None:
         for name in ("cell", "gap", "tolerance", "slack", "most_moves"):
@@ -53,26 +54,33 @@ class CoverConfig:
 
 
 class Cover:
-    """Thickness of cover on every level; `deposit`, then `relax`, then ask for `height` and `normal`."""
+    """Thickness of the cover on every level. Call `deposit`, then `relax`, then read `height` and `normal`."""
 
     def __init__(self, columns: Columns, config: CoverConfig) -> None:
         self.columns, self.config = columns, config
-        self.heights: Float[ndarray, " l"] = np.zeros(len(columns.base))  # m
-        self.lost = 0.0  # m^3 so far that ran off where nothing is
-        self._rested = self.heights.copy()  # when all of it was last at rest
-        self._changed = np.zeros(len(columns.base), np.bool_)  # since they last were at rest
+        self.heights: Float[ndarray, " l"] = np.zeros(len(columns.base))  # thickness, m
+        self.lost = 0.0  # m^3 so far that fell where there is no level
+        self._rested = self.heights.copy()  # thickness when all cover was last at rest
+        self._changed = np.zeros(len(columns.base), np.bool_)  # levels whose cover has changed since it was last at rest
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, config: CoverConfig | None = None) -> Cover:
-        """No cover yet, on all surfaces of a domain that look up."""
+        """A cover of thickness 0 on all surfaces of a domain that face up."""
         config = config or CoverConfig()
         return Cover(Columns.of(surface, domain, config.cell, config.gap), config)
 
     def deposit(self, points: Float[ndarray, "n 3"], volumes: Float[ndarray, " n"], radii: Float[ndarray, " n"]) -> float:
-        """Add m^3 of cover at points, each spread over a disc of its radius in metres (a paraboloid: thickest in the middle).
+        """Add cover at points, each spread over a horizontal disc as a paraboloid that is thickest in the middle.
 
-        The disc is horizontal and ends where its sheet does; a radius that reaches no middle of a square fills one square.
-        Returns the volume of points that belong to no level, also of those that are no numbers, which is not added.
+        The disc ends where its sheet ends. A disc that contains no middle of a square fills one square.
+
+        Args:
+            points: m.
+            volumes: m^3.
+            radii: of the discs, m.
+
+        Returns:
+            The volume in m^3 that is not added because its points belong to no level or are NaN.
 
         Raises:
             ValueError: a volume or radius is negative or not finite, or there are not as many of them as points.
@@ -84,9 +92,10 @@ class Cover:
         return float(volumes[level < 0].sum())
 
     def relax(self) -> bool:
-        """Let what is too steep run down; True when all of it has found its place, False where `most_moves` was not enough.
+        """Let cover run down where it is too steep. The next call goes on where this one stopped.
 
-        The next call goes on where this one stopped.
+        Returns:
+            True when all cover is at rest, False where `most_moves` did not suffice.
         """
         c, config = self.columns, self.config
         steep = math.tan(math.radians(config.repose_degrees)) * c.cell
@@ -101,47 +110,47 @@ class Cover:
         return len(left) == 0
 
     def find(self, points: Float[ndarray, "n 3"]) -> Int[ndarray, " n"]:
-        """Level that each point belongs to: in its cover or near its surfaces; -1 where there is none."""
+        """Level whose surface or cover each point (m) is in or near; -1 where there is none."""
         return self.columns.find(points, self.heights, self.config.tolerance)
 
     def height(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Thickness in metres at points on or near the surface, smooth within a sheet; 0 where there is no level."""
+        """Thickness of the cover in metres at points (m) on or near a surface, continuous within a sheet; 0 without a level."""
         return _read(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
 
     def above(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Height in metres of points above the bare surface beneath them, not negative; 0 where there is no level."""
+        """Height in metres of points (m) above the bare surface beneath them, not negative; 0 without a level."""
         level, above = self.find(points), np.zeros(len(points))
         known = level >= 0
         above[known] = points[known, 2] - self.columns.base[level[known]]
         return above.clip(0.0)
 
     def normal(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Unit normals of the raised surface, smooth within a sheet; straight up where there is no level."""
+        """Unit normals of the top of the cover at points (m), continuous within a sheet; straight up without a level."""
         slopes = _slopes(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
         normal = np.column_stack([-slopes, np.ones(len(slopes))])
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     @property
     def volume(self) -> float:
-        """m^3 of cover."""
+        """Volume of the cover, m^3."""
         return float(self.heights.sum()) * self.columns.cell**2
 
     @property
     def thickest(self) -> float:
-        """m."""
+        """Largest thickness, m."""
         return float(self.heights.max(initial=0.0))
 
     def snapshot(self) -> dict[str, ndarray]:
-        """Its state."""
+        """The state as arrays, for `restore`."""
         changed = self._changed.nonzero()[0]
-        rested = self._rested if len(changed) else self._rested[:0]  # at rest it says nothing new
+        rested = self._rested if len(changed) else self._rested[:0]  # at rest it equals the heights
         return {"heights": self.heights.copy(), "rested": rested.copy(), "changed": changed, "lost": np.array([self.lost])}
 
     def restore(self, arrays: Mapping[str, ndarray]) -> None:
-        """The state that `snapshot` gave.
+        """Take a state from `snapshot`.
 
         Raises:
-            ValueError: it is that of another surface.
+            ValueError: the state belongs to another surface.
         """
         if arrays["heights"].shape != self.heights.shape:
             found = len(arrays["heights"])
@@ -164,8 +173,8 @@ def _amounts(name: str, values: Float[ndarray, " n"], count: int, unit: str) -> 
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _walk(level, i, j, neighbours):
-    """Level that is i and j squares away on the same sheet, diagonals first; negative where the sheet ends before."""
+def _level_at(level, i, j, neighbours):
+    """Level i and j squares away on the same sheet, reached along diagonals first; negative where the sheet ends before."""
     right = 0 if i > 0 else 2
     ahead = 1 if j > 0 else 3
     corner = (4 if j > 0 else 7) if i > 0 else (5 if j > 0 else 6)
@@ -177,7 +186,7 @@ def _walk(level, i, j, neighbours):
 
 
 @numba.njit(cache=True, nogil=True)
-def _spread(level, points, volumes, radii, heights, touched, columns):
+def _spread(level, points, volumes, radii, heights, changed, columns):
     lower, cell = columns.lower, columns.cell
     nx, ny = columns.shape
     for n in range(len(level)):
@@ -190,33 +199,33 @@ def _spread(level, points, volumes, radii, heights, touched, columns):
         v = (points[n, 1] - lower[1]) / cell - y - 0.5
         inverse = (cell / radii[n]) ** 2 if radii[n] > 0.0 else np.inf
         thickness, total = volumes[n] / (cell * cell), 0.0
-        for passing in range(2):  # first how much weight finds a place, then the volume
+        for passing in range(2):  # first sum the weights on the sheet, then spread the volume
             for i in range(-reach, reach + 1):
                 for j in range(-reach, reach + 1):
                     weight = 1.0 - ((i - u) ** 2 + (j - v) ** 2) * inverse
                     if weight > 0.0:
-                        onto = _walk(own, i, j, columns.neighbours)
+                        onto = _level_at(own, i, j, columns.neighbours)
                         if onto >= 0 and passing == 0:
                             total += weight
                         elif onto >= 0:
                             heights[onto] += thickness * weight / total
-                            touched[onto] = True
+                            changed[onto] = True
             if total <= 0.0:
                 heights[own] += thickness
-                touched[own] = True
+                changed[own] = True
                 break
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _around(own, u, v, columns):
-    """The levels of the sheet at the corners of the square of middles around a point, and their weights; -1 for none."""
+def _corners(own, u, v, columns):
+    """Levels of the sheet at the four middles of squares around a point, negative where there is none, and their weights."""
     ny = columns.shape[1]
     x, y = columns.column[own] // ny, columns.column[own] % ny
     u = min(max((u - columns.lower[0]) / columns.cell - x - 0.5, -0.5), 0.5)
     v = min(max((v - columns.lower[1]) / columns.cell - y - 0.5, -0.5), 0.5)
     i, j = (1 if u >= 0 else -1), (1 if v >= 0 else -1)
     neighbours = columns.neighbours
-    levels = (own, _walk(own, i, 0, neighbours), _walk(own, 0, j, neighbours), _walk(own, i, j, neighbours))
+    levels = (own, _level_at(own, i, 0, neighbours), _level_at(own, 0, j, neighbours), _level_at(own, i, j, neighbours))
     u, v = abs(u), abs(v)
     shares = ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v)
     return levels, shares
@@ -224,11 +233,11 @@ def _around(own, u, v, columns):
 
 @numba.njit(cache=True, nogil=True)
 def _read(level, points, heights, columns):
-    """Bilinear thickness; where the sheet ends, the levels that exist share the weight."""
+    """Bilinear thickness; where the sheet ends, the existing levels share the weight."""
     found = np.zeros(len(level))
     for n in range(len(level)):
         if level[n] >= 0:
-            levels, shares = _around(level[n], points[n, 0], points[n, 1], columns)
+            levels, shares = _corners(level[n], points[n, 0], points[n, 1], columns)
             total = 0.0
             for m in range(4):
                 if levels[m] >= 0:
@@ -240,11 +249,11 @@ def _read(level, points, heights, columns):
 
 @numba.njit(cache=True, nogil=True)
 def _slopes(level, points, heights, columns):
-    """Rise per run of the raised surface along x and y: central differences at the middles, bilinear between them."""
+    """Rise per run of the top of the cover along x and y: central differences at the middles, bilinear between them."""
     found = np.zeros((len(level), 2))
     for n in range(len(level)):
         if level[n] >= 0:
-            levels, shares = _around(level[n], points[n, 0], points[n, 1], columns)
+            levels, shares = _corners(level[n], points[n, 0], points[n, 1], columns)
             total = 0.0
             for m in range(4):
                 own = levels[m]

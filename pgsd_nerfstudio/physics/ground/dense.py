@@ -1,9 +1,8 @@
-"""The hand-over to the dense regime: sliding matter that fills the air around it moves as a whole, by the material point
-method.
+"""Dense matter: crowded sliders move together, by the material point method (`mpm`).
 
-Each sliding particle stands for a volume of the layer (many real ones, and the time lapse of the cover). Where the volumes in a
-cell of the grid add up to `Dense.solid_fraction` of it, its particles become material points; what comes to rest on something
-is handed back and lies. The grid, Taichi and the obstacle's distances are made when the first particle needs them.
+Each slider has a volume of layer (many real particles, and the time lapse of the cover). Where these volumes fill a share
+`Dense.solid_fraction` of a cell of the grid, the cell's sliders become material points. A material point at rest lands. The
+grid, Taichi and the distances to the surface are made when the first particle needs them.
 """
 
 from __future__ import annotations
@@ -22,16 +21,20 @@ from pgsd_nerfstudio.physics.bodies import Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-FRAMES = 3  # frames for which matter must be slow before it rests
+FRAMES = 3  # frames for which matter must be slow before it is at rest
 
 
 class Moved(NamedTuple):
     """Dense particles after a step."""
 
     positions: Float[ndarray, "n 3"]
+    """m."""
     velocities: Float[ndarray, "n 3"]
+    """m/s."""
     rests: Bool[ndarray, " n"]
+    """Particles that have come to rest."""
     left: Bool[ndarray, " n"]
+    """Particles that have left the domain."""
 
 
 class DenseMatter:
@@ -41,10 +44,17 @@ class DenseMatter:
         self.dense, self.response, self.surface, self.domain = dense, response, surface, domain
         self._mpm = None
         self._ids = np.zeros(0, np.int64)
-        """Number of each of the run's dense bodies, in their order, within the solver."""
+        """Index in the solver of each of the run's dense particles, in their order."""
 
     def crowded(self, sliding: Bodies, volumes: Float[ndarray, " n"], dense: Bodies, filled: Float[ndarray, " d"]) -> ndarray:
-        """Which sliders lie in cells that sliders and dense matter (`filled`: its volumes) fill enough."""
+        """Which sliders are in cells that sliders and dense particles together fill enough, [n].
+
+        Args:
+            sliding: the sliders.
+            volumes: layer of each slider, m^3.
+            dense: the dense particles.
+            filled: layer of each dense particle, m^3.
+        """
         if len(sliding) == 0:
             return np.zeros(0, bool)
         cells = np.floor(np.concatenate([sliding.positions, dense.positions]) / self.dense.cell).astype(np.int64)
@@ -54,7 +64,12 @@ class DenseMatter:
         return total[cell[: len(sliding)]] >= self.dense.solid_fraction * self.dense.cell**3
 
     def add(self, bodies: Bodies, volumes: Float[ndarray, " n"]) -> None:
-        """Hand particles over; they follow those that are there already."""
+        """Add particles after the present ones.
+
+        Args:
+            bodies: the new dense particles.
+            volumes: layer of each, m^3.
+        """
         ids = self._solver().emit(
             torch.from_numpy(bodies.positions.astype(np.float64)),
             torch.from_numpy(bodies.velocities.astype(np.float64)),
@@ -64,7 +79,7 @@ class DenseMatter:
         self._ids = np.concatenate([self._ids, ids.numpy()])
 
     def step(self, seconds: float) -> Moved:
-        """Advance all of them; those that rest or left are forgotten by the next call."""
+        """Advance all dense particles; those that rest or have left are not part of the next step."""
         from pgsd_nerfstudio.physics.mpm import REMOVED, RESTING
 
         solver = self._solver()
@@ -76,14 +91,14 @@ class DenseMatter:
         return Moved(positions, velocities, rests, left)
 
     def snapshot(self) -> dict[str, ndarray]:
-        """Its state as arrays; empty where there never was dense matter."""
+        """The state as arrays, for `restore`; empty where there never was dense matter."""
         if self._mpm is None:
             return {}
         rows = {f"mpm.{name}": value.numpy(force=True).copy() for name, value in self._mpm.snapshot().items()}
         return rows | {"dense_ids": self._ids.copy()}
 
     def restore(self, arrays: Mapping[str, ndarray]) -> None:
-        """The state that `snapshot` gave."""
+        """Take a state from `snapshot`."""
         if "dense_ids" not in arrays:
             self._mpm, self._ids = None, np.zeros(0, np.int64)
             return
@@ -102,7 +117,7 @@ class DenseMatter:
                 lower = np.asarray(self.domain.lower) - cell
                 grid = DistanceGrid.of(self.surface, lower, np.asarray(self.domain.upper) + cell, cell)
                 slopes = np.stack(np.gradient(grid.values.astype(np.float64), cell), -1)
-                # Far from any surface distances are clamped and have no slope; nothing touches there.
+                # Far from any surface distances are clamped and have no slope; there are no contacts there.
                 steep = np.linalg.norm(slopes, axis=-1, keepdims=True)
                 normals = np.where(steep > 1e-6, slopes / steep.clip(1e-6), [0.0, 0.0, 1.0])
                 corner = (float(grid.lower[0]), float(grid.lower[1]), float(grid.lower[2]))

@@ -1,5 +1,4 @@
-"""What has come down: the cover that raises the surface, the water that wets it, and matter so thick that it moves as a
-whole."""
+"""Deposits of an effect in a scene: the cover on its surfaces, their wetness, and dense matter."""
 
 from __future__ import annotations
 
@@ -18,11 +17,11 @@ from pgsd_nerfstudio.physics.ground.dense import DenseMatter
 from pgsd_nerfstudio.physics.ground.wetness import WetnessGrid, Wetting
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-WETTEST = 2e5  # squares of the plan from which the cells of wetness grow with the scene
+WETTEST = 2e5  # cells of wetness in the plan, at most; in larger scenes the cells grow
 
 
 class Deposits:
-    """All that an effect leaves in a scene; changes from frame to frame."""
+    """All deposits of an effect in a scene; they change from frame to frame."""
 
     def __init__(self, effect: Effect, surface: SurfaceMesh, domain: Domain) -> None:
         self.effect = effect
@@ -38,20 +37,25 @@ class Deposits:
             self.wetness = WetnessGrid.of(surface, domain, Wetting(cell=cell))
         self.dense = DenseMatter(effect.dense, response, surface, domain) if effect.dense is not None and stays else None
         self.missed = 0.0
-        """m^3 of layer, or kg of water, that came down where nothing could hold it."""
+        """m^3 of layer, or kg of water, of particles that landed where no level or cell could hold it."""
 
     def volumes(self, bodies: Bodies) -> Float[ndarray, " n"]:
-        """m^3 of layer that particles stand for."""
+        """Volume of the layer of each particle, m^3."""
         return layer_volume(self.effect, bodies.diameters.astype(np.float64), bodies.represents.astype(np.float64))
 
     def masses(self, bodies: Bodies) -> Float[ndarray, " n"]:
-        """kg of the real particles that particles stand for."""
+        """Mass of the real particles that each particle represents, kg."""
         return self.effect.material.mass(bodies.diameters.astype(np.float64)) * bodies.represents
 
     def lay(self, bodies: Bodies, *, heaped: bool = False) -> Float[ndarray, " n"]:
-        """Add what has landed to the cover; returns the thickness in metres on which each particle lies.
+        """Add landed particles to the cover.
 
-        heaped: they came to rest on each other, and lie where they are rather than on what the cover knows of.
+        Args:
+            bodies: the particles at their contacts.
+            heaped: the particles came to rest on each other and keep their height where that is above the cover.
+
+        Returns:
+            The thickness in metres on which each particle rests.
         """
         if self.cover is None or len(bodies) == 0:
             return np.zeros(len(bodies))
@@ -64,17 +68,22 @@ class Deposits:
         return np.maximum(height, self.cover.above(points)) if heaped else height
 
     def wet(self, bodies: Bodies, share: Float[ndarray, " n"]) -> None:
-        """Add the water of drops, `share` of each."""
+        """Add water of drops to the wetness.
+
+        Args:
+            bodies: drops at their contacts.
+            share: of each drop's water that is added, 0-1.
+        """
         if self.wetness is not None and len(bodies):
             self.missed += self.wetness.deposit(bodies.positions.astype(np.float64), share * self.masses(bodies))
 
     def age(self, seconds: float) -> None:
-        """What time alone does: water spreads and dries."""
+        """Let water spread and dry."""
         if self.wetness is not None:
             self.wetness.step(seconds)
 
     def snapshot(self) -> dict[str, ndarray]:
-        """Its state as arrays."""
+        """The state as arrays, for `restore`."""
         arrays = {"missed": np.array([self.missed])}
         if self.cover is not None:
             arrays |= {f"cover.{name}": value for name, value in self.cover.snapshot().items()}
@@ -84,7 +93,7 @@ class Deposits:
         return arrays | (self.dense.snapshot() if self.dense is not None else {})
 
     def restore(self, arrays: Mapping[str, ndarray]) -> None:
-        """The state that `snapshot` gave; nothing to restore is a start without anything."""
+        """Take a state from `snapshot`; without arrays nothing changes."""
         if not arrays:
             return
         self.missed = float(arrays["missed"][0])

@@ -1,13 +1,13 @@
-"""How cover runs down where it lies too steep.
+"""Toppling: cover runs down where it is too steep.
 
-A level may rise above its neighbours only so far that the raised surface is nowhere steeper than the angle of repose. The slope
-is that of the steepest of the eight triangles between a level and two squares beside each other (Tarboton, "A new method for
-the determination of flow directions", 1997), so the highest allowed top is the update of the eikonal equation |grad z| = tan(
-repose) on eight triangles (Tsitsiklis 1995; Sethian 1996): heaps become cones. The plain sandpile rule, which compares with one
-neighbour at a time, makes them octagons, 8 % wider along some directions.
+A level may rise above its neighbours only so far that the top of the cover is nowhere steeper than the angle of repose. The
+slope is that of the steepest of the eight triangles between a level and two neighbours side by side (Tarboton, "A new method
+for the determination of flow directions", 1997), so the highest allowed top is the update of the eikonal equation |grad z| =
+tan(repose) on eight triangles (Tsitsiklis 1995; Sethian 1996): heaps become cones. The plain sandpile rule compares with one
+neighbour at a time and makes octagons, 8 % wider along some directions.
 
-That highest top never falls when a neighbour rises. So levels may be kept from ending lower than they were at rest, and slopes
-hold all the same: what lay at rest may lie there again.
+The highest allowed top never falls when a neighbour rises. Levels can therefore be kept from becoming lower than they were at
+rest without slopes becoming too steep.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ROOT = 1.4142135623730951
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _limit_on_sheet(level, heights, columns, steep):
-    """Highest top that the neighbours of the sheet allow, the triangle (k, d) that says so, and the share of d."""
+    """Highest top that the sheet's neighbours allow, the two neighbours that limit it, and the share of the second one."""
     limit, side, corner, share = np.inf, -1, -1, 0.0
     for k in range(4):
         for turn in range(2):
@@ -47,35 +47,48 @@ def _limit_on_sheet(level, heights, columns, steep):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _limit_at_end(level, k, heights, columns, steep, film):
-    """Highest top that the end of the sheet in direction k allows, and whether what is beyond reaches up so far."""
+    """Highest top that the end of the sheet in direction k allows, and whether the cover beyond reaches up to the edge."""
     kind, beyond = columns.neighbours[level, k], columns.beyond[level, k]
     step = steep if k < 4 else _ROOT * steep
     if kind == BORDER:
-        # Beyond, the surface goes on as it comes, under the same cover: that is steeper than repose where the base is.
+        # Beyond the border the surface goes on with the same slope and cover, so cover runs out where the base is too steep.
         behind = columns.neighbours[level, (k + 2) % 4] if k < 4 else -1
         runs = behind >= 0 and columns.base[behind] - columns.base[level] > step
         return (columns.base[level] + film if runs else np.inf), False
     against = columns.base[beyond] + heights[beyond] + step if beyond >= 0 else (np.inf if kind == WALL else -np.inf)
     if kind == WALL:
         return against, True
-    # Beyond an edge there is nothing to lean on: cover ends half a square away, with the film.
+    # Beyond a drop nothing supports the cover: it ends half a square away, with the film.
     edge = columns.base[level] + film + 0.5 * step
     return max(edge, against), against > edge
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _push(level, queue, queued, head, size):
+    """Append a level to the ring `queue` unless it is in it; returns the new size."""
+    if not queued[level]:
+        queued[level] = True
+        queue[(head + size) % len(queue)] = level
+        size += 1
+    return size
+
+
 @numba.njit(cache=True, nogil=True)
 def topple(start, heights, rested, columns, steep, film, slack, most):
-    """Let cover give way from the levels `start` [s] on, at most `most` times.
+    """Let cover run down.
 
     Args:
-        heights: [l] m, changed in place.
-        rested: [l] m, heights when all was at rest; none becomes lower.
+        start: [s] levels to examine first.
+        heights: [l] thickness in metres, changed in place.
+        rested: [l] thickness in metres when all cover was at rest; no level becomes thinner.
+        columns: the levels.
         steep: rise in metres from square to square at the angle of repose.
         film: thickness in metres that does not move.
         slack: metres by which a top may be too high.
+        most: largest number of moves.
 
     Returns:
-        The levels [r] that still have to be looked at, and the thickness in metres that fell where nothing is.
+        The levels [r] that remain to be examined, and the thickness in metres that fell where there is no level.
     """
     column, first = columns.column, columns.first
     nx, ny = columns.shape
@@ -84,9 +97,7 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
     queue = np.empty(count, np.int32)
     head, size, moves, lost = 0, 0, 0, 0.0
     for level in start:
-        queue[size] = level
-        queued[level] = True
-        size += 1
+        size = _push(level, queue, queued, head, size)
     while size > 0 and moves < most:
         level = queue[head]
         head = head + 1 if head + 1 < count else 0
@@ -102,7 +113,7 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
             else:
                 ended = True
         if top - lowest <= steep + slack and not ended:
-            continue  # the limit is never lower than this: most visits end here
+            continue  # the limit is never lower than this bound, which settles most visits
         limit, side, corner, share = _limit_on_sheet(level, heights, columns, steep)
         ending, leans, ends = np.inf, False, 0
         for k in range(8):
@@ -125,34 +136,27 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
                     onto = columns.beyond[level, k]
                     if onto >= 0:
                         heights[onto] += give / ends
-                        if not queued[onto]:
-                            queued[onto] = True
-                            queue[(head + size) % count] = onto
-                            size += 1
+                        size = _push(onto, queue, queued, head, size)
                     else:
                         lost += give / ends
         else:
-            # As much as brings the level onto the limit that its neighbours then have, to first order.
+            # To first order this brings the level onto the limit that its neighbours then set.
             give = min(excess / (1.0 + share * share + (1.0 - share) * (1.0 - share)), loose)
             if side >= 0:
                 heights[side] += (1.0 - share) * give
             if corner >= 0:
                 heights[corner] += share * give
             for onto in (side, corner):
-                if onto >= 0 and not queued[onto]:
-                    queued[onto] = True
-                    queue[(head + size) % count] = onto
-                    size += 1
-        heights[level] = max(heights[level] - give, rested[level])  # of which a difference may fall short by round-off
-        # Whatever leant on this level may follow; itself too.
+                if onto >= 0:
+                    size = _push(onto, queue, queued, head, size)
+        heights[level] = max(heights[level] - give, rested[level])  # the difference may be lower by round-off
+        # Levels that this one supported may topple next, and so may the level itself.
         x, y = column[level] // ny, column[level] % ny
         for i in range(max(x - 1, 0), min(x + 2, nx)):
             for j in range(max(y - 1, 0), min(y + 2, ny)):
                 for near in range(first[i * ny + j], first[i * ny + j + 1]):
-                    if not queued[near] and heights[near] > film + slack:
-                        queued[near] = True
-                        queue[(head + size) % count] = near
-                        size += 1
+                    if heights[near] > film + slack:
+                        size = _push(near, queue, queued, head, size)
     left = np.empty(size, np.int64)
     for n in range(size):
         left[n] = queue[(head + n) % count]

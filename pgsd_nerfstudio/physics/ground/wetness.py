@@ -1,10 +1,10 @@
-"""Water on surfaces: what lands is put into a grid around them, spreads, and dries.
+"""Wetness of surfaces: a grid around them takes the water of drops, which spreads and dries.
 
-Only cells near the surface exist (the paper: "a coarse 3D grid surrounding the mesh"), as one list of cells and a sparse matrix
-of who touches whom, so memory follows the area of the surface and not the volume of the air: about 110 bytes a cell. Between
-cells water diffuses by the heat equation on that graph, dw/dt = (D / h^2) sum over neighbours (w_j - w_i), which no wall of
-missing cells lets through. Its step of any length is the exact exponential: inside the band the water of a point becomes the
-discrete Gaussian (Lindeberg 1990) whose variance is 2 D t along each axis. Drying takes the same share from all cells.
+Only cells near the surface exist (the paper: "a coarse 3D grid surrounding the mesh"). They are one list of cells and a sparse
+matrix of neighbours, so memory follows the area of the surface and not the volume of the air: about 110 bytes a cell. Water
+diffuses between cells by the heat equation on that graph, dw/dt = (D / h^2) sum over neighbours (w_j - w_i); none of it leaves
+the cells. A step of any length is the exact exponential: inside the band the water of a point becomes the discrete Gaussian
+(Lindeberg 1990) whose variance is 2 D t along each axis. Drying takes the same share from all cells.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.ground.landing import sample_triangles
+from pgsd_nerfstudio.physics.ground.landing import sample_triangles, triangle_corners
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 MAX_CELLS = 20_000_000  # 2.2 GB
-_TAIL = 1e-13  # of the water of a cell that a step may place one cell too near
+_TAIL = 1e-13  # share of a cell's water that a step may move too short a distance
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wetting:
-    """How surfaces become wet and dry."""
+    """How water spreads and dries."""
 
     cell: float = 0.05
     """Edge of a cell in metres; finer wet patches are not resolved."""
     reach: int = 2
-    """Cells on each side of the surface that can hold water: one for the interpolation, one to spread around edges."""
+    """Cells on each side of the surface that can hold water: one for interpolation, one to spread around edges."""
     diffusivity: float = 2e-5
     """m^2/s; a spot of water grows to a standard deviation of 5 cm within a minute."""
     drying_seconds: float = 120.0
-    """Time in which a surface loses 63 % of its water; inf never dries."""
+    """Seconds in which a surface loses 63 % of its water; inf: it never dries."""
 
     def __post_init__(self) -> None:
         if not (self.cell > 0 and self.reach >= 1 and self.diffusivity >= 0 and self.drying_seconds > 0):
@@ -46,12 +46,18 @@ class Wetting:
 
 
 class WetnessGrid:
-    """Water near a surface; `deposit`, `step` and `sample` it. Cells are known by their lattice points, their centres."""
+    """Water in the cells near a surface. Each cell is centred on a lattice point, whose index is its key."""
 
     def __init__(
         self, points: Float[ndarray, "p 3"], lower: Float[ndarray, "3"], shape: tuple[int, int, int], wetting: Wetting
     ):
-        """A grid of the cells within `reach` of points that cover the surface, of a lattice that starts at `lower`.
+        """Make the cells within `Wetting.reach` of the surface.
+
+        Args:
+            points: points that cover the surface, m.
+            lower: first point of the lattice, m.
+            shape: lattice points along each axis.
+            wetting: cell size and laws of spreading and drying.
 
         Raises:
             ValueError: there would be more than 20 million cells.
@@ -66,11 +72,13 @@ class WetnessGrid:
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, wetting: Wetting | None = None) -> WetnessGrid:
-        """Around a surface, within a box of air."""
+        """The cells around a surface, in metres, within a domain.
+
+        Raises:
+            ValueError: there would be more than 20 million cells.
+        """
         wetting = wetting or Wetting()
-        corners = np.zeros((0, 3, 3))
-        if len(surface.triangles):
-            corners = surface.vertices.numpy(force=True)[surface.triangles.numpy(force=True)].astype(np.float64)
+        corners = triangle_corners(surface).astype(np.float64)
         x, y, z = (math.ceil(edge / wetting.cell) + 1 for edge in domain.size)
         return WetnessGrid(sample_triangles(corners, wetting.cell / 2), np.asarray(domain.lower), (x, y, z), wetting)
 
@@ -89,17 +97,21 @@ class WetnessGrid:
 
     @property
     def bytes(self) -> int:
-        """Memory of the grid."""
+        """Memory of the grid in bytes."""
         matrix = self._mixing
         return sum(part.nbytes for part in (self.keys, self.water, matrix.data, matrix.indices, matrix.indptr))
 
     def deposit(self, points: Float[ndarray, "n 3"], mass: Float[ndarray, " n"]) -> float:
-        """Add `mass` kg of water at each point, shared among the lattice points around it as trilinear weights say.
+        """Add water at points, shared among the existing ones of the eight lattice points around each, with trilinear weights.
 
-        What falls on lattice points that do not exist goes to those that do; returns the kg of points that had none at all,
-        which are not deposited.
+        Args:
+            points: m.
+            mass: kg at each point.
+
+        Returns:
+            The kg of points without any lattice point around them, which are not added.
         """
-        cells, weights = self._around(points)
+        cells, weights = self._corners(points)
         total = weights.sum(1)
         caught = total > 0
         share = weights[caught] / total[caught, None] * np.asarray(mass, np.float64)[caught, None]
@@ -108,20 +120,20 @@ class WetnessGrid:
         return float(np.asarray(mass, np.float64)[~caught].sum())
 
     def step(self, seconds: float) -> None:
-        """Spread and dry for as long as `seconds`; exact, so that steps may have any length."""
+        """Let water spread and dry for `seconds`; the step is exact for any length."""
         self._spread(seconds)
         before = self.held
         self.water *= math.exp(-seconds / self.wetting.drying_seconds)
         self.evaporated += before - self.held
 
     def sample(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """kg of water per m^3 at points, interpolated between the lattice points that exist; 0 where there are none."""
-        cells, weights = self._around(points)
+        """Water in kg/m^3 at points (m), interpolated between the existing lattice points; 0 where there are none."""
+        cells, weights = self._corners(points)
         found = (weights * self.water[cells]).sum(1) if len(self) else np.zeros(len(points))
         return found / weights.sum(1).clip(1e-12) / self.wetting.cell**3
 
     def _spread(self, seconds: float) -> None:
-        """exp(t L) by uniformisation (Jensen 1953): a Poisson-weighted mean of powers of a matrix that only mixes.
+        """exp(t L) by uniformisation (Jensen 1953): a Poisson-weighted mean of powers of a stochastic matrix.
 
         All terms are positive and their weights sum to one, so that water neither becomes negative nor is lost.
         """
@@ -147,7 +159,7 @@ class WetnessGrid:
 
     @cached_property
     def _mixing(self) -> csr_array:
-        """1 + L / 6: every cell gives a sixth of its water to each neighbour and keeps what has nowhere to go."""
+        """1 + L / 6: every cell gives a sixth of its water to each existing neighbour and keeps the rest."""
         at = np.stack(np.unravel_index(self.keys, self.shape), 1)
         rows, columns = [], []
         for axis in range(3):
@@ -163,8 +175,8 @@ class WetnessGrid:
         data = np.concatenate([np.full(len(row), 1 / 6), keep])
         return csr_array((data, (np.concatenate([row, own]), np.concatenate([column, own]))), shape=(count, count))
 
-    def _around(self, points: Float[ndarray, "n 3"]) -> tuple[Int[ndarray, "n 8"], Float[ndarray, "n 8"]]:
-        """The eight lattice points around each point and their weights, 0 where there is none."""
+    def _corners(self, points: Float[ndarray, "n 3"]) -> tuple[Int[ndarray, "n 8"], Float[ndarray, "n 8"]]:
+        """Indices of the cells at the eight lattice points around each point, and their weights, 0 where there is no cell."""
         at = (np.asarray(points, np.float64) - self.lower) / self.wetting.cell
         at = np.where(np.isfinite(at), at, -2.0)
         corner = np.floor(at)
@@ -181,7 +193,7 @@ class WetnessGrid:
         return np.stack(cells, 1), np.stack(weights, 1)
 
     def _find(self, keys: Int[ndarray, " n"]) -> tuple[Int[ndarray, " n"], ndarray]:
-        """Index of each key, and whether it is there."""
+        """Index of each key among the cells, and whether it is one of them."""
         if len(self) == 0:
             return np.zeros(len(keys), np.int64), np.zeros(len(keys), bool)
         found = np.searchsorted(self.keys, keys).clip(max=len(self) - 1)
@@ -189,14 +201,14 @@ class WetnessGrid:
 
     def _near(self, points: Float[ndarray, "p 3"]) -> Int[ndarray, " c"]:
         """Sorted keys of the lattice points within `reach` cells of the points along every axis."""
-        # Within `reach` beyond the lattice, so that cells at its border know of what lies just outside. One number a cell:
-        # sorting rows takes far longer.
+        # Points up to `reach` outside of the lattice also make cells inside. Keys are one number each, since sorting rows of
+        # three takes far longer.
         reach, wide = self.wetting.reach, tuple(side + 2 * self.wetting.reach for side in self.shape)
         at = np.rint((points - self.lower) / self.wetting.cell).astype(np.int64) + reach
         at = at[((at >= 0) & (at < wide)).all(1)]
         keys = np.unique(np.ravel_multi_index(tuple(at.T), wide))
         steps = np.arange(-reach, reach + 1)
-        for axis in range(3):  # a cube grows axis by axis
+        for axis in range(3):  # grow a cube axis by axis
             place = np.stack(np.unravel_index(keys, wide), 1)
             moved = np.repeat(place, len(steps), 0)
             moved[:, axis] += np.tile(steps, len(place))
