@@ -1,12 +1,12 @@
 """Signed distance to a surface on a grid, exact near the surface and clamped farther away.
 
-Only lattice points near the surface are asked for their distance: cubes of 8 points that may hold some are found first, then
-cubes of 4, 2 and 1. Meshes of captures have holes and triangles that face the wrong way, so the sign does not come from
-the normals of the nearest triangle. Rays go from a point to the upper half of the sky; a point is outside where the sky shows
-along a quarter of them, and else inside (negative) where most cross the surface an odd number of times: below the ground or
-within a body, but not below a table top that was seen from above only. A hole turns the rays that pass through it, not their
-majority; flipped triangles turn none. Two sheets above each other look like the two sides of a slab to such counts; there, and
-only there, the majority of normals around decides.
+Distances are computed only for lattice points near the surface: the search finds cubes of 8 points that may hold some, then
+cubes of 4, 2 and 1. Meshes of captures have holes and triangles that face the wrong way, so the sign does not come from the
+normals of the nearest triangle. Rays go from a point to the upper half of the sky. The point is outside if a quarter of them
+reach the sky; otherwise it is inside (negative) if most of them cross the surface an odd number of times, as they do below the
+ground or within a body, but not below a table top that was seen only from above. A hole changes the count of the rays that pass
+through it and not the majority; flipped triangles change no count. Two sheets above each other give the same counts as the two
+sides of a slab; there, and only there, the majority of the normals around the point decides.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from torch import Tensor
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
 
 MAX_POINTS = 100_000_000  # 400 MB
-RAYS = 24  # per point whose sign is asked
-SKY = 0.25  # share of them along which the sky must show for a point to be outside whatever the others say
+RAYS = 24  # per point whose sign is computed
+SKY = 0.25  # a point is outside if at least this share of its rays reach the sky, whatever the others cross
 LOWEST = 0.2  # sine of the lowest ray's elevation: flatter ones graze the ground
-STRIDE = 3  # farther away than the band every so many points are asked for their sign, their neighbours follow
+STRIDE = 3  # beyond the band, signs are computed for one point in so many along each axis; the others copy the nearest
 AROUND = 2  # points on each side over which normals are averaged where they decide
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Signed distances on a lattice, positive outside; four bytes a point."""
+    """Signed distances on a lattice, positive outside; each point takes four bytes."""
 
     lower: Float[ndarray, "3"]
     """First lattice point, metres."""
@@ -42,8 +42,9 @@ class DistanceGrid:
     band: float
     """Metres from the surface within which distances are exact; farther away they are +band or -band."""
     values: Float[ndarray, "x y z"]
+    """Metres."""
     asked: int
-    """Lattice points that were asked for their distance."""
+    """Number of points whose distance was computed."""
 
     @staticmethod
     def of(
@@ -52,7 +53,9 @@ class DistanceGrid:
         """Distances to a surface in a box; an empty surface leaves everything outside.
 
         Args:
-            lower: corner of the box, metres; the first lattice point. The last one is at or just beyond `upper`.
+            surface: triangles in metres.
+            lower: corner of the box in metres, and the first lattice point.
+            upper: opposite corner in metres; the last lattice point is there or just beyond.
             cell: metres between lattice points.
             band: cells on each side of the surface.
 
@@ -81,7 +84,10 @@ class DistanceGrid:
     def sample(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
         """Distance in metres at points, interpolated between eight lattice points, and its gradient, which points outwards.
 
-        Beyond the box the nearest point of the box is taken. The gradient is short or zero beyond the band.
+        A point beyond the box gets the values of the nearest point of the box. The gradient is short or zero beyond the band.
+
+        Args:
+            points: in metres.
         """
         at = ((np.asarray(points, np.float64) - self.lower) / self.cell).clip(0, np.array(self.values.shape) - 1)
         corner = np.minimum(at.astype(np.int64), np.array(self.values.shape) - 2)
@@ -96,7 +102,11 @@ class DistanceGrid:
         return value, gradient / self.cell
 
     def normals(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Unit normals of the open side at points in the band; zero where the distance has no slope."""
+        """Unit normals of the open side at points in the band; zero where the distance has no slope.
+
+        Args:
+            points: in metres.
+        """
         _, gradient = self.sample(points)
         return gradient / np.linalg.norm(gradient, axis=1, keepdims=True).clip(1e-9)
 
@@ -104,7 +114,7 @@ class DistanceGrid:
 def _near(
     surface: SurfaceMesh, lower: Float[ndarray, "3"], shape: tuple[int, ...], cell: float, reach: float
 ) -> tuple[Int[ndarray, "n 3"], Float[ndarray, " n"], int]:
-    """Lattice points within `reach` metres of the surface, their distances, and how many points were asked."""
+    """Lattice points within `reach` metres of the surface, their distances, and how many distances were computed."""
     scene, asked = surface.raycasting, 0
     edge = 8
     cubes = np.stack(np.meshgrid(*[np.arange(0, count, edge) for count in shape], indexing="ij"), -1).reshape(-1, 3)
@@ -126,8 +136,8 @@ def _sides(
 ) -> Bool[ndarray, "x y z"]:
     """Which lattice points are inside, given those in the band.
 
-    Beyond the band every third point is asked and its neighbours follow it: they are on its side, since the nearest point that
-    was asked is nearer than the band is wide.
+    Beyond the band, signs are computed for every third point and copied to its neighbours. These are on the same side, since
+    the nearest point with a computed sign is nearer than the band is wide.
     """
     near, every = np.zeros(shape, bool), np.zeros(shape, bool)
     near[tuple(points.T)] = True
@@ -151,7 +161,7 @@ def _sides(
 
 
 def _by_crossings(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> tuple[Bool[ndarray, " n"], Bool[ndarray, " n"]]:
-    """Which points are inside by the parity of crossings, and which are not but see no sky either."""
+    """Which points are inside by the parity of crossings, and which are not inside although they see no sky."""
     odd, sky = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for direction in _upward(RAYS):
         rays = queries(_tensor(points), _tensor(np.broadcast_to(direction, points.shape)))
@@ -163,7 +173,7 @@ def _by_crossings(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> tuple[
 
 
 def _facing(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-    """Mean over the rays: +1 where the first triangle that is met shows its front, -1 where its back."""
+    """Mean over the rays of +1 if the first triangle on the ray shows its front, -1 if it shows its back."""
     total = np.zeros(len(points), np.float32)
     for direction in _upward(RAYS):
         rays = queries(_tensor(points), _tensor(np.broadcast_to(direction, points.shape)))
@@ -173,7 +183,7 @@ def _facing(surface: SurfaceMesh, points: Float[ndarray, "n 3"]) -> Float[ndarra
 
 
 def _upward(count: int) -> Float[ndarray, "r 3"]:
-    """Directions that cover the sky above LOWEST evenly (golden spiral)."""
+    """Unit directions that cover the sky above LOWEST evenly (golden spiral)."""
     at = np.arange(count) + 0.5
     z = LOWEST + (1 - LOWEST) * at / count
     turn = math.pi * (1 + math.sqrt(5)) * at

@@ -1,7 +1,8 @@
-"""Depth images fused into triangles: a truncated signed distance on sparse voxel blocks, near the cameras fine, beyond coarse.
+"""Depth images fused into triangles by a truncated signed distance on sparse voxel blocks.
 
-Curless & Levoy, "A volumetric method for building complex models from range images" (1996), in Open3D's VoxelBlockGrid
-(Dong et al. 2022). Every view also clears what it sees through, so that stray Gaussians before a surface leave nothing behind.
+The method is that of Curless & Levoy, "A volumetric method for building complex models from range images" (1996), in Open3D's
+VoxelBlockGrid (Dong et al. 2022). Every view also clears the space that it sees through, so stray Gaussians in front of a
+surface leave no triangles.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ FAR_AWAY = 1e6  # m, depth of the sky
 
 
 def open3d() -> Any:
-    """Open3D, imported when first needed: that takes seconds. Untyped, since its stubs know no NumPy arrays."""
+    """Open3D, imported at the first call because the import takes seconds. Its stubs know no NumPy arrays, hence `Any`."""
     return importlib.import_module("open3d")
 
 
@@ -36,13 +37,13 @@ class Fusion:
     reach: float
     """Depth in metres beyond which nothing is fused."""
     truncation: float = 8.0
-    """Signed distances are kept up to this many voxels from a surface: above the noise of rendered depth, or holes are torn."""
+    """Signed distances are kept up to this many voxels from a surface; below the noise of the depth, meshes get holes."""
     min_component: float = 12.0
-    """A component of the mesh whose bounding box is shorter than this many voxels is noise, and removed."""
+    """A component of the mesh is removed as noise if its bounding box is shorter than this many voxels."""
 
 
 Region = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
-"""Signed distance in metres of points to the border of what is wanted; negative inside."""
+"""Signed distance in metres from points to the border of a part of space; negative inside."""
 
 
 def everywhere(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -56,7 +57,11 @@ def fuse(
     fusion: Fusion,
     region: Region = everywhere,
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices in metres and triangles, those with their middle in the region; their winding faces the side the cameras saw."""
+    """Fuse depth images into triangles whose winding faces the side that the cameras saw.
+
+    Returns:
+        Vertices in metres, and the triangles with their middle in the region.
+    """
     o3d = open3d()
     core = o3d.core
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -64,7 +69,7 @@ def fuse(
     )
     views = []
     for depth, viewmat, K in zip(depths, cameras.viewmats, cameras.Ks, strict=True):
-        # What lies beyond reach, and the sky, clears the space before it but touches no blocks.
+        # Depth beyond `reach`, and the sky, clears the space in front of it but activates no blocks.
         touched = _image(torch.where(depth < fusion.reach, depth, 0.0))
         camera = (core.Tensor(K.double().cpu().numpy()), core.Tensor(viewmat.double().cpu().numpy()))
         views.append((_image(depth.clamp(max=FAR_AWAY)), camera))
@@ -97,10 +102,10 @@ def without_silhouettes(
     pixels: float = 60.0,
     share: float = 0.1,
 ) -> Float[Tensor, "h w"]:
-    """Depth with 0 beside silhouettes and the sky, where the expected depth lies between two surfaces and on neither.
+    """Depth in metres, set to 0 beside silhouettes and the sky, where the expected depth lies between two surfaces.
 
-    A silhouette is where neighbours differ by more than a surface explains that is seen at 2 degrees (a step of 60 pixel
-    widths), or by a tenth of the depth.
+    A pixel is at a silhouette if its neighbourhood spans more than 60 pixel widths of depth (a surface seen at 2 degrees spans
+    as much), or more than a tenth of the depth.
     """
     edge = min(pixels / focal, share)
     image = np.pad(depth.float().cpu().clamp(max=FAR_AWAY).numpy(), 1, mode="edge")
@@ -133,14 +138,14 @@ def _without_crumbs(
 def _in_order(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The mesh with only the vertices that its triangles use, in an order that does not depend on the order of threads."""
+    """The mesh with only the vertices that its triangles use, in an order that does not depend on threads."""
     used, renumbered = np.unique(triangles, return_inverse=True)
     vertices, triangles = vertices[used].astype(np.float32), renumbered.reshape(-1, 3)
     order = np.lexsort(vertices.T)
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     triangles = rank[triangles]
-    # Turned until the lowest index comes first, which keeps the winding.
+    # Each triangle is rotated until its lowest index comes first, which keeps the winding.
     turned = (triangles.argmin(1)[:, None] + np.arange(3)) % 3
     triangles = np.take_along_axis(triangles, turned, axis=1)
     return vertices[order], triangles[np.lexsort(triangles.T[::-1])]

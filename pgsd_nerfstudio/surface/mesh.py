@@ -1,7 +1,7 @@
-"""What weather lands on: the surface of a scene as a triangle mesh in metres, asked by rays and closest points.
+"""The surface of a scene, on which particles land: a triangle mesh in metres with queries for rays and closest points.
 
-The mesh comes from the depth of the frozen Gaussians as the training cameras see it (`fusion`), so it works for any capture;
-rays and closest points run in Open3D's RaycastingScene (Embree).
+The mesh is fused (fusion.py) from the depth of the frozen Gaussians as the training cameras see it, so it works for any
+capture. Rays and closest points run in Open3D's RaycastingScene (Embree).
 """
 
 from __future__ import annotations
@@ -26,55 +26,61 @@ from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.fusion import Fusion, Region, fuse, open3d, without_silhouettes
 
-VERSION = 1  # of the fusion: cached meshes of another one are not read
-VIEWS = 40  # training cameras whose depth is fused, at most
+VERSION = 1  # of the fusion; cached meshes of another version are not read
+VIEWS = 40  # number of training cameras whose depth is fused, at most
 PIXELS = 512  # of the longer side of a depth image, at most
 HAZE, HARDENING = 0.1, 3.0  # see `solid`
-NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in median distances between the cameras and what they look at
-NEAR = 1.25  # radius of the finely fused ball around what the cameras look at, in the same
+NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance from the cameras to what they look at
+NEAR = 1.25  # radius of the finely fused ball around what the cameras look at, in radii
 MAX_TRIANGLES = {"near": 330_000, "far": 70_000}
 
 
 class Hits(NamedTuple):
-    """Where rays first meet the surface."""
+    """First hits of rays on the surface."""
 
     distance: Float[Tensor, " n"]
-    """In lengths of the ray's direction: metres for unit directions, 0..1 along a displacement. inf where nothing is hit."""
+    """In lengths of the ray's direction: metres for unit directions, 0..1 along a displacement. It is inf without a hit."""
     normal: Float[Tensor, "n 3"]
-    """Unit normals of the open side; zero where nothing is hit."""
+    """Unit normals of the open side; zero without a hit."""
 
 
 class Closest(NamedTuple):
     """The surface points nearest to given points."""
 
     points: Float[Tensor, "n 3"]
+    """Metres."""
     normals: Float[Tensor, "n 3"]
     """Unit normals of the open side."""
     distance: Float[Tensor, " n"]
-    """Metres, never negative; inf where the mesh is empty."""
+    """Metres, never negative; inf if the mesh is empty."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
-    """Triangles in metres, z up. Their winding faces the open side, from which the cameras saw them. May be empty."""
+    """Triangles in metres, z up. Their winding faces the open side, from which the cameras saw them. A mesh may be empty."""
 
     vertices: Float[Tensor, "v 3"]
     triangles: Int[Tensor, "f 3"]
 
     @staticmethod
     def empty() -> SurfaceMesh:
-        """Nothing to land on."""
+        """A mesh without triangles."""
         return SurfaceMesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"]:
-        """Lowest and highest corner; zeros where the mesh is empty."""
+        """Lowest and highest corner in metres; zeros if the mesh is empty."""
         if len(self.vertices) == 0:
             return torch.zeros(2, 3)
         return torch.stack(self.vertices.aminmax(dim=0))
 
     def cast(self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Hits:
-        """First hits of rays, from either side of the surface."""
+        """First hits of rays, from either side of the surface.
+
+        Args:
+            origins: where the rays start, in metres.
+            directions: of any length; distances count in this length.
+        """
         n = len(origins)
         if len(self.triangles) == 0 or n == 0:
             return Hits(torch.full((n,), torch.inf), torch.zeros(n, 3))
@@ -83,7 +89,11 @@ class SurfaceMesh:
         return Hits(distance, self._normals_at(found, torch.isfinite(distance)))
 
     def closest(self, points: Float[Tensor, "n 3"]) -> Closest:
-        """Nearest surface points, however far."""
+        """Nearest points of the surface, however far away.
+
+        Args:
+            points: in metres.
+        """
         if len(self.triangles) == 0 or len(points) == 0:
             points = torch.as_tensor(points, dtype=torch.float32).cpu()
             up = torch.tensor([0.0, 0.0, 1.0]).repeat(len(points), 1)
@@ -96,7 +106,7 @@ class SurfaceMesh:
 
     @cached_property
     def vertex_normals(self) -> Float[Tensor, "v 3"]:
-        """Mean of the adjoining triangles' normals, weighted by area."""
+        """Unit normals of the vertices: the mean of the adjoining triangles' normals, weighted by area."""
         corners = self.vertices[self.triangles.long()]
         area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         total = torch.zeros_like(self.vertices).index_add_(0, self.triangles.long().flatten(), area.repeat_interleave(3, 0))
@@ -112,7 +122,7 @@ class SurfaceMesh:
         return scene
 
     def _normals_at(self, found: dict[str, Any], hit: Tensor) -> Float[Tensor, "n 3"]:
-        """Vertex normals blended where a triangle was found; the triangle's own where the blend would be of no length."""
+        """Vertex normals interpolated at each hit; the triangle's own normal if the interpolated one nearly vanishes."""
         normals = torch.zeros(len(hit), 3)
         which = torch.from_numpy(found["primitive_ids"].numpy().astype(np.int64))[hit]
         u, v = torch.from_numpy(found["primitive_uvs"].numpy())[hit].unbind(1)
@@ -126,15 +136,18 @@ class SurfaceMesh:
 def surface_of(
     scene: Scene, rasterizer: Rasterizer, *, voxel: float | None = None, cache: bool = True, progress: bool = True
 ) -> SurfaceMesh:
-    """The surface of a scene, from the depth of its solid part as (at most 40 of) its training cameras see it.
+    """The surface of a scene, from the depth of its solid part as at most 40 of its training cameras see it.
 
-    Finer inside the ring of the cameras than beyond it, nothing beyond four times their distance; at most 400,000 triangles,
-    for which voxels grow. Kept in the cache under the hash of the scene and of these settings.
+    The mesh is finer inside the ring of the cameras than beyond it and ends at four times their distance. It has at most
+    400,000 triangles; voxels grow until it does. It is kept in the cache under the hash of the scene and of these settings.
 
     Args:
-        rasterizer: of the scene; says on which device depth is rendered.
-        voxel: edge of a voxel inside the cameras' ring in metres; 1/80 of the cameras' distance where not given. Five times as
-            much beyond.
+        scene: the frozen scene with its training cameras.
+        rasterizer: of the scene; depth is rendered on its device.
+        voxel: edge of a voxel inside the cameras' ring in metres, by default 1/80 of the cameras' distance; voxels beyond the
+            ring are five times as large.
+        cache: whether to read the mesh from the cache, and to write it there.
+        progress: whether to show a progress bar.
 
     Raises:
         ValueError: `voxel` is not positive.
@@ -166,11 +179,11 @@ def surface_from_depths(
     radius: float,  # m, from the cameras to it
     voxel: float,  # m, inside the cameras' ring
 ) -> SurfaceMesh:
-    """Depth images fused, finely inside a ball of 1.25 radii around the centre and coarsely up to 4 radii from the cameras."""
+    """Fuse depth images: finely inside a ball of 1.25 radii around the centre, coarsely up to 4 radii from the cameras."""
     inside, far_voxel = NEAR * radius, voxel * FAR_VOXEL / NEAR_VOXEL
     middle = center.numpy()
     sharp = [without_silhouettes(depth, float(K[0, 0])) for depth, K in zip(depths, cameras.Ks, strict=True)]
-    # The outside reaches in by one voxel, so that no gap stays between the two.
+    # The far region reaches into the near one by one voxel, so that no gap stays between the two.
     near: Region = lambda points: np.linalg.norm(points - middle, axis=1) - inside  # noqa: E731
     far: Region = lambda points: inside - far_voxel - np.linalg.norm(points - middle, axis=1)  # noqa: E731
     vertices, triangles = _fuse_within(MAX_TRIANGLES["near"], sharp, cameras, Fusion(voxel=voxel, reach=REACH * radius), near)
@@ -182,14 +195,14 @@ def surface_from_depths(
 
 
 def solid(gaussians: Gaussians) -> Gaussians:
-    """The part of a scene that stops things: what its depth is taken from. Plain colours.
+    """The solid part of a scene, from which its depth is rendered; all colours are zero.
 
-    The expected depth of a trained splat lies behind its surfaces, where a little light leaks through, and before them, where
-    faint haze explains reflections. Without Gaussians below an opacity of 0.1, and with the others hardened to
-    1 - (1 - opacity)^3 (three of each), light stops at the first surface: on a garden table the spread of depth fell from 2.8
-    to 1.1 cm, and the mesh within 5 cm of it grew from 66 to 90 percent of the pixels. The price: surfaces lie up to a
-    standard deviation of their Gaussians too far out (measured there: 0.5 cm on the table, 2 to 3 cm on the ground). More
-    hardening raises that, less leaves holes.
+    The expected depth of a trained splat lies behind a surface through which a little light leaks, and in front of a surface
+    whose reflections faint haze imitates. Gaussians below an opacity of 0.1 are therefore left out and the others hardened to
+    1 - (1 - opacity)^3 (three of each), so that light stops at the first surface: on a garden table the spread of depth fell
+    from 2.8 to 1.1 cm, and the mesh within 5 cm of it grew from 66 to 90 percent of the pixels. The price is that surfaces lie
+    up to a standard deviation of their Gaussians too far out (measured there: 0.5 cm on the table, 2 to 3 cm on the ground).
+    More hardening raises that error, less leaves holes.
     """
     kept = gaussians.select(gaussians.opacities > HAZE)
     plain = torch.zeros_like(kept.means)
@@ -197,7 +210,7 @@ def solid(gaussians: Gaussians) -> Gaussians:
 
 
 def _stored(path: Any) -> SurfaceMesh | None:
-    """The mesh of a cache file; None where there is none, or where it is not one of ours."""
+    """The mesh of a cache file; None if there is no file, or if it holds no such mesh."""
     found = load_tensors(path)
     if found is None or set(found[0]) != {"vertices", "triangles"}:
         return None
@@ -215,7 +228,7 @@ def _views(cameras: Cameras) -> Cameras:
 
 @torch.no_grad()
 def _render_depths(scene: Scene, device: torch.device, cameras: Cameras, progress: bool) -> list[Float[Tensor, "h w"]]:
-    """Depth in metres; 0 where the solid part is half transparent, inf where there is nothing but sky."""
+    """Depth in metres; 0 where the solid part is half transparent, inf where it is absent and the sky shows."""
     rasterizer, depths = choose_rasterizer(solid(scene.gaussians), device), []
     for index in track(range(len(cameras)), "Surface: depth of the training views", disable=not progress, transient=True):
         seen = rasterizer.render(cameras[index].to(device))
@@ -228,7 +241,7 @@ def _render_depths(scene: Scene, device: torch.device, cameras: Cameras, progres
 def _fuse_within(
     budget: int, depths: Sequence[Float[Tensor, "h w"]], cameras: Cameras, fusion: Fusion, region: Region
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fused with voxels as wished, or as much larger as the budget of triangles demands."""
+    """Vertices and triangles of a region; voxels grow until the triangles keep within the budget."""
     while True:
         vertices, triangles = fuse(depths, cameras, fusion, region)
         if len(triangles) <= budget:
@@ -237,6 +250,6 @@ def _fuse_within(
 
 
 def queries(*parts: Float[Tensor, "n 3"]) -> Any:
-    """Points, or origins and directions, as Open3D takes them."""
+    """Points, or origins and directions, as the tensor that Open3D expects."""
     columns = [torch.as_tensor(part).detach().float().cpu() for part in parts]
     return open3d().core.Tensor(torch.cat(columns, dim=1).contiguous().numpy())
