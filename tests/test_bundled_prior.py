@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pgsd_nerfstudio.guidance import VideoPrior
+from pgsd_nerfstudio.guidance import load_prior
 from pgsd_nerfstudio.guidance.folder import BUNDLED
 
 ROOT = Path(__file__).parent.parent
@@ -24,7 +24,7 @@ needs_weights = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def prior():
-    return VideoPrior.load("bundled", "cpu")
+    return load_prior("bundled", "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_the_training_script_makes_a_loadable_folder(tmp_path):
     output = tmp_path / "prior"
     words = [sys.executable, str(script), "--quick", "--work", str(tmp_path / "work"), "--output", str(output)]
     subprocess.run(words, check=True, timeout=600)
-    toy = VideoPrior.load(output, "cpu")
+    toy = load_prior(output, "cpu")
     assert toy.encode(torch.rand(9, 3, 64, 96)).isfinite().all()
     assert (output / "README.md").is_file() and (tmp_path / "work" / "samples.png").is_file()
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 import torch
-from guidance_tiny import scheduler_2b, write_tiny
 
-from pgsd_nerfstudio.guidance import DistillationConfig, TimestepSchedule, VideoPrior, distill, distill_clip
+from pgsd_nerfstudio.guidance import DistillationConfig, TimestepSchedule, distill, distill_clip, load_prior
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b, write_tiny
 
 SHAPE = (1, 3, 4, 5, 6)
 TEXT, NEGATIVE = torch.ones(1, 2, 2), torch.zeros(1, 2, 2)
@@ -192,7 +192,7 @@ def test_guidance_leads_away_from_the_negative_prompt():
 
 def test_gradient_on_the_clip_is_autograd_of_the_explicit_expression(tmp_path):
     """d/d clip of sum(stop_gradient(g) * latents(clip)), and of 1/2 |z - stop_gradient(z - g)|^2, g the gradient per frame."""
-    prior = VideoPrior.load(write_tiny(tmp_path / "prior"))
+    prior = load_prior(write_tiny(tmp_path / "prior"))
     text, negative = prior.encode_prompt(["snow is falling", "no snow"]).split(1)
     config, clip = DistillationConfig(), torch.rand(9, 3, 32, 48, generator=seeded(4))
     found = distill_clip(prior, clip, text, negative, 400, config=config, generator=seeded(6))

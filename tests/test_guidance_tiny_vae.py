@@ -4,12 +4,12 @@ import pickle
 
 import pytest
 import torch
-from guidance_tiny import tiny_pipeline, write_tiny
 from safetensors.torch import save_file
 from torch.nn.functional import conv2d
 
-from pgsd_nerfstudio.guidance import PriorError, VideoPrior
+from pgsd_nerfstudio.guidance import CogVideoXPrior, PriorError
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
 
 STAGES = ((2, 2), (7, 2), (12, 1))
 """Position of each stage's merging layer in the published file, and how many frames it merges."""
@@ -131,18 +131,9 @@ def test_a_gradient_of_zero_has_no_direction(tiny):
 
 
 @pytest.fixture(scope="module")
-def prior(tmp_path_factory) -> VideoPrior:
+def prior(tmp_path_factory) -> CogVideoXPrior:
     """A random prior with 16 latent channels, which the small encoder fits."""
-    from diffusers.models.autoencoders.autoencoder_kl_cogvideox import AutoencoderKLCogVideoX
-    from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
-
-    pipeline = tiny_pipeline()
-    pipeline.vae = AutoencoderKLCogVideoX.from_config({**pipeline.vae.config, "latent_channels": 16})
-    config = {**pipeline.transformer.config, "in_channels": 16, "out_channels": 16}
-    pipeline.transformer = CogVideoXTransformer3DModel.from_config(config)
-    folder = tmp_path_factory.mktemp("prior16")
-    pipeline.save_pretrained(folder)
-    return VideoPrior.load(folder)
+    return CogVideoXPrior.load(write_tiny(tmp_path_factory.mktemp("prior16"), latent_channels=16))
 
 
 def test_a_prior_encodes_through_the_small_encoder_and_is_itself_unchanged(prior, tiny):
@@ -159,7 +150,7 @@ def test_a_prior_encodes_through_the_small_encoder_and_is_itself_unchanged(prior
 
 
 def test_a_prior_with_other_latents_is_refused(tiny, tmp_path):
-    small = VideoPrior.load(write_tiny(tmp_path / "small"))
+    small = CogVideoXPrior.load(write_tiny(tmp_path / "small"))
     with pytest.raises(PriorError, match=r"16 latent channels, 8 pixels and 4 frames per latent, .* has 4, 8 and 4"):
         small.through(tiny)
     with pytest.raises(PriorError, match=r"one shape, found \[1, 3, 16, 4, 6\] for \[1, 3, 4, 4, 6\]"):

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from guidance_tiny import scheduler_2b
 
 from pgsd_nerfstudio.guidance import (
     DistillationConfig,
@@ -19,6 +18,7 @@ from pgsd_nerfstudio.guidance import (
     roles_of,
 )
 from pgsd_nerfstudio.guidance.prompts import BELONGS, BRIDGE_FLAWS, NFSD_FLAWS
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b
 
 SHAPE = (1, 3, 4, 5, 6)
 ALPHAS = scheduler_2b().alphas_cumprod.double()

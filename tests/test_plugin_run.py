@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from guidance_tiny import write_tiny
 from plugin_scene import HEIGHT, VIEWS, WIDTH, tiny_config, train, write_scene
 from wan_tiny import tiny_wan
 
 from pgsd_nerfstudio.dynamics import FieldConfig, RegularizationWeights
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
 
@@ -316,15 +316,15 @@ def test_a_full_disk_is_said_in_a_sentence(prior: Path, tmp_path: Path, monkeypa
 def test_a_prior_that_predicts_nan_skips_its_step_and_is_given_up_after_three_with_a_checkpoint(
     trained: Path, prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from pgsd_nerfstudio.guidance.video_prior import VideoPrior
+    from pgsd_nerfstudio.guidance import CogVideoXPrior
 
-    whole, calls = VideoPrior.predict_v, []
+    whole, calls = CogVideoXPrior.predict_v, []
 
-    def broken_at_first(self: VideoPrior, noisy: torch.Tensor, timestep: int, text: torch.Tensor) -> torch.Tensor:
+    def broken_at_first(self: CogVideoXPrior, noisy: torch.Tensor, timestep: int, text: torch.Tensor) -> torch.Tensor:
         calls.append(timestep)
         return whole(self, noisy, timestep, text) * (float("nan") if len(calls) == 1 or forever else 1.0)
 
-    monkeypatch.setattr(VideoPrior, "predict_v", broken_at_first)
+    monkeypatch.setattr(CogVideoXPrior, "predict_v", broken_at_first)
     scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
     forever = False
     opened(train(tiny_config(scene, prior, tmp_path / "once")))

@@ -27,7 +27,7 @@ PATIENCE = 120  # s
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of ns-viewer, showing a run in its own process."""
-    from guidance_tiny import write_tiny
+    from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
 
     folder = tmp_path_factory.mktemp("run")
     dense = {"max_particles": 4000, "seconds": 2.0, "steps": 1}

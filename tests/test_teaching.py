@@ -11,7 +11,7 @@ from pgsd_nerfstudio.dynamics import DynamicsField, LearnedLook, Rollout, regula
 from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights
 from pgsd_nerfstudio.effects import effect, initial_look
 from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
-from pgsd_nerfstudio.guidance import DistillationConfig, VideoPrior, distill_clip
+from pgsd_nerfstudio.guidance import DistillationConfig, distill_clip, load_prior
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, regularization_scale
 from pgsd_nerfstudio.physics import Clock, simulate_metric
 from pgsd_nerfstudio.physics.clock import domain_of
@@ -50,7 +50,7 @@ def lesson():
     history = simulate_metric(surface, snow, clock, domain_of(scene), seed=3, max_particles=20_000, progress=False)
     curated = initial_look(snow, history, seed=3)
     start = InitialLook(wrong(curated.active), wrong(curated.collided), curated.settle_seconds)
-    prior, rasterizer = VideoPrior.load("bundled", "cpu"), choose_rasterizer(scene.gaussians, "cpu")
+    prior, rasterizer = load_prior("bundled", "cpu"), choose_rasterizer(scene.gaussians, "cpu")
     frames, height, width = prior.clip_shape
     text = prior.encode_prompt([snow.prompt_for(scene.description)])
     against = prior.encode_prompt([snow.negative_prompt])

@@ -1,7 +1,8 @@
 """Random Wan models of a few thousand parameters, written as diffusers writes them."""
 
 import torch
-from guidance_tiny import WORDS
+
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import WORDS
 
 
 def tiny_wan(seed: int = 0, flow_shift: float = 3.0):

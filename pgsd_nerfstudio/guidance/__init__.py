@@ -1,7 +1,9 @@
 """TAUGHT: video diffusion. Sees only clips, knows nothing of Gaussians."""
 
+from pgsd_nerfstudio.guidance.cogvideox import CogVideoXPrior
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, Distilled, DistilledClip, distill, distill_clip
 from pgsd_nerfstudio.guidance.folder import PriorError
+from pgsd_nerfstudio.guidance.loading import load_prior
 from pgsd_nerfstudio.guidance.prompts import Prompts, embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule, WeightDecay, Weighting, regularization_scale
 from pgsd_nerfstudio.guidance.variants import Embeddings, Omega, Role, Variant, roles_of
@@ -9,6 +11,7 @@ from pgsd_nerfstudio.guidance.video_prior import VideoPrior
 from pgsd_nerfstudio.guidance.wan import WanPrior
 
 __all__ = [
+    "CogVideoXPrior",
     "DistillationConfig",
     "Distilled",
     "DistilledClip",
@@ -26,6 +29,7 @@ __all__ = [
     "distill",
     "distill_clip",
     "embed_texts",
+    "load_prior",
     "prompts_for",
     "regularization_scale",
     "roles_of",

@@ -42,21 +42,12 @@ class Family:
     """The prediction_type of a scheduler that does not name one."""
 
 
-COGVIDEOX = Family(
-    "CogVideoX",
-    {"transformer": "CogVideoXTransformer3DModel", "vae": "AutoencoderKLCogVideoX"},
-    channels="latent_channels",
-    prediction="v_prediction",
-    example="THUDM/CogVideoX-2b",
-)
-
-
-def find_prior(place: str | Path, family: Family = COGVIDEOX) -> Path:
-    """The folder of a video prior.
+def find_prior(place: str | Path, family: Family) -> Path:
+    """The folder of a video prior of one family.
 
     Args:
         place: "bundled", a local folder, or the id of a model on the Hugging Face hub such as "THUDM/CogVideoX-2b".
-        family: what it must be.
+        family: what the model must be of.
 
     Raises:
         PriorError: there is no such folder or model, or it is not a complete text-to-video model of this family.
@@ -67,7 +58,7 @@ def find_prior(place: str | Path, family: Family = COGVIDEOX) -> Path:
 
 
 def find_folder(place: str | Path) -> Path:
-    """The same, whatever is in it: of CogVideoX, of another family, or of no video prior at all.
+    """The same, whatever is in it: a video prior of any family, or none at all.
 
     Raises:
         PriorError: there is no such folder or model.
@@ -78,6 +69,14 @@ def find_folder(place: str | Path) -> Path:
         return BUNDLED
     folder = Path(place).expanduser()
     return folder if folder.exists() else _download(str(place))
+
+
+def is_of(folder: Path, family: Family) -> bool:
+    """Whether the transformer in a folder says that it is of a family; False where it says nothing."""
+    try:
+        return read_config(folder, "transformer").get("_class_name") == family.classes["transformer"]
+    except PriorError:
+        return False
 
 
 def fingerprint(folder: Path) -> str:

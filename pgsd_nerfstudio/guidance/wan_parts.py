@@ -1,4 +1,4 @@
-"""The parts of a Wan model as diffusers writes them: where they lie, the transformer's weights, the VAE's memory, the texts."""
+"""The parts of a Wan model as diffusers writes them: the transformer's weights, the VAE's memory, the texts."""
 
 from __future__ import annotations
 
@@ -15,40 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from pgsd_nerfstudio.guidance.folder import Family, PriorError, find_prior, read_config
+from pgsd_nerfstudio.guidance.folder import PriorError
 from pgsd_nerfstudio.guidance.text import PromptEncoder
-
-WAN = Family(
-    "Wan",
-    {"transformer": "WanTransformer3DModel", "vae": "AutoencoderKLWan"},
-    channels="z_dim",
-    prediction="flow_prediction",
-    example="Wan-AI/Wan2.1-T2V-1.3B-Diffusers",
-    assumed="flow_prediction",
-)
-
-
-def is_wan(folder: Path) -> bool:
-    """Whether a folder's transformer says it is Wan's; False where it says nothing."""
-    try:
-        return read_config(folder, "transformer").get("_class_name") == WAN.classes["transformer"]
-    except PriorError:
-        return False
-
-
-def find_wan(place: str | Path) -> Path:
-    """The folder of a Wan text-to-video model, judged before any weight is read.
-
-    Raises:
-        PriorError: there is no such folder or model, or it is not a complete Wan text-to-video model with one transformer.
-    """
-    folder = find_prior(place, WAN)
-    if (folder / "transformer_2").is_dir():
-        raise PriorError(
-            f"{folder} shares the noise levels between two transformers, as Wan 2.2 does, where one is expected; "
-            f"use a Wan 2.1 model such as {WAN.example}"
-        )
-    return folder
 
 
 def read_transformer(folder: Path, dtype: torch.dtype) -> Any:

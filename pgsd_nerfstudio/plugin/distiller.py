@@ -11,14 +11,12 @@ from rich.console import Console
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, DistilledClip, distill_clip
-from pgsd_nerfstudio.guidance.folder import find_folder, find_prior, read_config
+from pgsd_nerfstudio.guidance.loading import load_prior
 from pgsd_nerfstudio.guidance.prompts import embed_texts, prompts_for
 from pgsd_nerfstudio.guidance.schedules import TimestepSchedule
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
 from pgsd_nerfstudio.guidance.variants import Embeddings
 from pgsd_nerfstudio.guidance.video_prior import VideoPrior
-from pgsd_nerfstudio.guidance.wan import WanPrior
-from pgsd_nerfstudio.guidance.wan_parts import find_wan, is_wan
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import WeatherOptions
 
@@ -81,15 +79,13 @@ def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[Vid
         RunError: the prior cannot be used, or the weather is shorter than a clip.
     """
     try:
-        folder = find_folder(options.prior)
-        kind, judged = (WanPrior, find_wan) if is_wan(folder) else (VideoPrior, find_prior)
-        native = int(read_config(judged(folder), "transformer").get("sample_frames", PAPER_FRAMES))
-        prior = kind.load(folder, device, frames=options.clip_frames or min(native, PAPER_FRAMES))
+        prior = load_prior(options.prior, device, frames=options.clip_frames)
+        own, height, width = prior.clip_shape
+        frames = options.clip_frames or min(own, PAPER_FRAMES)
         if options.tiny_vae is not None:
-            prior = _through_tiny(prior, options.tiny_vae)
+            prior = _through_tiny(prior, options.tiny_vae, frames)
     except (ValueError, OSError) as error:
         raise RunError(str(error)) from error
-    frames, height, width = prior.clip_shape
     if options.frames < frames:
         raise RunError(
             f"the weather has {options.frames} frames ({options.seconds:g} s), a training clip {frames}: use more --seconds"
@@ -98,10 +94,10 @@ def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[Vid
     return prior, replace(options, clip_frames=frames, **sizes)
 
 
-def _through_tiny(prior: VideoPrior, weights: Path) -> VideoPrior:
-    """The prior with a tiny encoder before it; says how far their gradients agree on a clip of noise in the prior's size."""
+def _through_tiny(prior: VideoPrior, weights: Path, frames: int) -> VideoPrior:
+    """The prior with a tiny encoder before it; prints how far their gradients agree on so many frames of noise in its size."""
     tiny = TinyEncoder.load(weights, prior.device, prior.dtype)
-    frames, height, width = prior.clip_shape
+    _, height, width = prior.clip_shape
     clip = torch.rand(frames, 3, height, width, generator=torch.Generator().manual_seed(0)).to(prior.device)
     console.print(f"tiny VAE {weights.name}: cosine of its gradient with the full one {gradient_cosine(prior, tiny, clip):.3f}")
     return prior.through(tiny)

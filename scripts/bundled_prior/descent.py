@@ -19,7 +19,7 @@ from bundled_prior.families import FRAMES, HEIGHT, WIDTH
 from bundled_prior.looks import WRONG
 from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.effects import effect, initial_look
-from pgsd_nerfstudio.guidance import DistillationConfig, VideoPrior, distill_clip
+from pgsd_nerfstudio.guidance import DistillationConfig, distill_clip, load_prior
 from pgsd_nerfstudio.physics import Clock, simulate_metric
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
@@ -64,7 +64,7 @@ def descend(
     history = simulate_metric(surface, snow, clock, domain_of(scene), seed=97, max_particles=max_particles, progress=False)
     curated = initial_look(snow, history, seed=97)
     wrong, learned = with_look(curated, WRONG), LearnedLook()
-    prior, rasterizer = VideoPrior.load(folder, "cpu"), choose_rasterizer(scene.gaussians, "cpu")
+    prior, rasterizer = load_prior(folder, "cpu"), choose_rasterizer(scene.gaussians, "cpu")
     text = prior.encode_prompt([snow.prompt_for(scene.description)])
     against = prior.encode_prompt([negative.format(scene=scene.description)])
     optimizer = torch.optim.Adam(learned.parameters(), lr=rate, betas=(0.9, 0.99))

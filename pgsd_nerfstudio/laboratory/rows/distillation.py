@@ -19,6 +19,7 @@ from pgsd_nerfstudio.guidance import (
     regularization_scale,
 )
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b
 
 SHAPE = (1, 3, 4, 6, 8)
 ALPHA_BAR = {20: "0.944", 500: "0.0953", 740: "0.0122", 980: "2.4e-5", 999: "0.0"}
@@ -97,18 +98,6 @@ def rows(quick: bool) -> list[Record]:
         ),
         *(_mode_row(variant, 800 if quick else 2000) for variant in get_args(Variant)),
     ]
-
-
-def scheduler_2b():
-    from diffusers.schedulers.scheduling_ddim_cogvideox import CogVideoXDDIMScheduler
-
-    return CogVideoXDDIMScheduler(
-        beta_schedule="scaled_linear",
-        prediction_type="v_prediction",
-        rescale_betas_zero_snr=True,
-        snr_shift_scale=3.0,
-        timestep_spacing="trailing",
-    )
 
 
 def _alpha_bar_error() -> float:

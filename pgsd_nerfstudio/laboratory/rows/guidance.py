@@ -9,16 +9,18 @@ import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.guidance import (
+    CogVideoXPrior,
     DistillationConfig,
     PriorError,
     VideoPrior,
     distill_clip,
+    load_prior,
 )
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows import distillation as rows_distillation
 from pgsd_nerfstudio.laboratory.rows import prior_costs as rows_prior_costs
-from pgsd_nerfstudio.laboratory.rows.distillation import scheduler_2b
 from pgsd_nerfstudio.laboratory.timing import best
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b, tiny_models
 
 TEXTS = ["Fluffy snowflakes are falling in a courtyard, accumulating on surfaces.", "static, no snow, blurry"]
 PIPELINE = "noise prediction of {} against diffusers' pipeline"
@@ -61,7 +63,7 @@ def _bundled_costs() -> list[Record]:
         best(lambda: prior.predict_v(noisy, 500, both), 2),
         best(lambda: _distill_clip(prior, clip, text, negative), 2),
     )
-    exact_prior = VideoPrior.load("bundled", prior.device, torch.float64)
+    exact_prior = load_prior("bundled", prior.device, torch.float64)
     exact = _distill_clip(exact_prior, clip, text, negative)
     error = float((_distill_clip(prior, clip, text, negative) - exact).norm() / exact.norm())
     where = f"clip of {frames} frames of {width}x{height} on {prior.device}"
@@ -72,42 +74,14 @@ def _bundled_costs() -> list[Record]:
 
 
 def _bundled() -> tuple[VideoPrior, Tensor, Tensor]:
-    prior = VideoPrior.load("bundled", "cuda" if torch.cuda.is_available() else "cpu")
+    prior = load_prior("bundled", "cuda" if torch.cuda.is_available() else "cpu")
     text, negative = prior.encode_prompt(TEXTS).split(1)
     return prior, text, negative
 
 
-def _random_prior() -> VideoPrior:
-    """A CogVideoX of a few thousand random parameters; it never was on disk and has no text encoder."""
-    from diffusers.models.autoencoders.autoencoder_kl_cogvideox import AutoencoderKLCogVideoX
-    from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
-
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        transformer = CogVideoXTransformer3DModel(
-            num_attention_heads=2,
-            attention_head_dim=16,
-            in_channels=4,
-            out_channels=4,
-            time_embed_dim=8,
-            text_embed_dim=16,
-            num_layers=2,
-            sample_height=4,
-            sample_width=6,
-            sample_frames=9,
-            max_text_seq_length=12,
-        )
-        vae = AutoencoderKLCogVideoX(
-            block_out_channels=(8, 8, 8, 8),  # type: ignore[arg-type]
-            latent_channels=4,
-            layers_per_block=1,
-            norm_num_groups=2,
-            sample_height=32,
-            sample_width=48,
-        )
-    for model in (transformer, vae):
-        torch.nn.Module.eval(model).requires_grad_(False)
-    return VideoPrior(Path("random"), transformer, vae, scheduler_2b())
+def _random_prior() -> CogVideoXPrior:
+    """It never was on disk and has no text encoder."""
+    return CogVideoXPrior(Path("random"), *tiny_models(), scheduler_2b())
 
 
 def _random_texts() -> tuple[Tensor, Tensor]:

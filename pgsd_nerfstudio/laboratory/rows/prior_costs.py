@@ -16,11 +16,12 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from pgsd_nerfstudio.guidance import VideoPrior
+from pgsd_nerfstudio.guidance import CogVideoXPrior, VideoPrior
+from pgsd_nerfstudio.guidance.cogvideox import recompute_resnets
 from pgsd_nerfstudio.guidance.memory import MemoryMeter, weights
 from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder
-from pgsd_nerfstudio.guidance.video_prior import recompute_resnets
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b
 
 FRAMES, HEIGHT, WIDTH = 9, 480, 720
 TEXT = (2, 226, 4096)
@@ -82,13 +83,11 @@ def rows(quick: bool) -> Iterable[Record]:
         yield Record(f"the same arithmetic, {how}", arithmetic(arrangement) / 1e12, "TFLOP", source=COUNTED)
 
 
-def random_2b(device: str, arrangement: Arrangement = USED) -> VideoPrior:
+def random_2b(device: str, arrangement: Arrangement = USED) -> CogVideoXPrior:
     """CogVideoX-2B with random weights in float16; under FakeTensorMode it needs no memory."""
     from diffusers.models.autoencoders.autoencoder_kl_cogvideox import AutoencoderKLCogVideoX
     from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
-    from diffusers.schedulers.scheduling_ddim_cogvideox import CogVideoXDDIMScheduler
 
-    scheduler = CogVideoXDDIMScheduler(prediction_type="v_prediction", rescale_betas_zero_snr=True)
     with torch.device(device), _default_dtype(torch.float16):
         transformer = CogVideoXTransformer3DModel(sample_frames=FRAMES).eval().requires_grad_(False)
         vae = AutoencoderKLCogVideoX().eval().requires_grad_(False)
@@ -96,7 +95,7 @@ def random_2b(device: str, arrangement: Arrangement = USED) -> VideoPrior:
         recompute_resnets(vae)
     elif arrangement.recomputed == "stages too":
         vae.enable_gradient_checkpointing()
-    return VideoPrior(Path("CogVideoX-2B with random weights"), transformer, vae, scheduler)
+    return CogVideoXPrior(Path("CogVideoX-2B with random weights"), transformer, vae, scheduler_2b())
 
 
 def counted(arrangement: Arrangement = USED) -> Count:

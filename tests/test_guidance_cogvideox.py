@@ -1,4 +1,4 @@
-"""The video prior against diffusers' own pipeline, and what it says to a folder that is none."""
+"""CogVideoX as a video prior against diffusers' own pipeline, and what it says to a folder that is none."""
 
 import json
 import shutil
@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from guidance_tiny import scheduler_2b, there_and_back, tiny_pipeline, write_tiny
+from guidance_prior import rewrite, there_and_back
 
-from pgsd_nerfstudio.guidance import PriorError, VideoPrior, folder
+from pgsd_nerfstudio.guidance import CogVideoXPrior, PriorError, folder
 from pgsd_nerfstudio.guidance.text import token_ids
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import scheduler_2b, tiny_pipeline, write_tiny
 
 PROMPT, NEGATIVE = "snow is falling in a garden", "no snow"
 
@@ -20,18 +21,14 @@ def tiny(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def prior(tiny) -> VideoPrior:
-    return VideoPrior.load(tiny)
+def prior(tiny) -> CogVideoXPrior:
+    return CogVideoXPrior.load(tiny)
 
 
 @pytest.fixture
 def broken(tiny, tmp_path) -> Path:
     """A copy to damage."""
     return Path(shutil.copytree(tiny, tmp_path / "broken"))
-
-
-def rewrite(path: Path, **changes) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def test_alpha_bar_is_that_of_cogvideox_2b(prior):
@@ -47,7 +44,7 @@ def test_alpha_bar_is_that_of_cogvideox_2b(prior):
 def test_prediction_is_that_of_diffusers_pipeline(tmp_path, monkeypatch, variant, frames, height, width):
     pipeline = tiny_pipeline(variant)
     pipeline.save_pretrained(tmp_path / "prior")
-    prior = VideoPrior.load(tmp_path / "prior")
+    prior = CogVideoXPrior.load(tmp_path / "prior")
     noisy = torch.randn(1, (frames - 1) // 4 + 1, 4, height // 8, width // 8, generator=torch.Generator().manual_seed(1))
     seen = {}
 
@@ -76,7 +73,7 @@ def test_prediction_is_that_of_diffusers_pipeline(tmp_path, monkeypatch, variant
 
 
 def test_odd_latent_frames_of_the_larger_models_are_padded_in_front_and_dropped(tmp_path):
-    prior = VideoPrior.load(write_tiny(tmp_path / "prior", "1.5"))
+    prior = CogVideoXPrior.load(write_tiny(tmp_path / "prior", "1.5"))
     noisy, text = torch.randn(1, 3, 4, 4, 6), prior.encode_prompt([PROMPT])
     padded = prior.predict_v(torch.cat([noisy[:, :1], noisy], dim=1), 500, text)
     assert torch.equal(prior.predict_v(noisy, 500, text), padded[:, 1:])
@@ -90,7 +87,7 @@ def test_positions_are_made_once_per_clip_shape(prior, monkeypatch):
 
 
 def test_positions_are_held_in_half_precision_and_are_those_that_diffusers_makes_in_every_call(tiny):
-    held, made = (VideoPrior.load(tiny, dtype=torch.float16) for _ in range(2))
+    held, made = (CogVideoXPrior.load(tiny, dtype=torch.float16) for _ in range(2))
     text, noisy = held.encode_prompt([PROMPT]), torch.randn(1, 5, 4, 8, 6, generator=torch.Generator().manual_seed(3)).half()
     truth = made.transformer(noisy, text, torch.tensor([300]), return_dict=False)[0]
     assert torch.equal(held.predict_v(noisy, 300, text), truth.float())
@@ -99,9 +96,9 @@ def test_positions_are_held_in_half_precision_and_are_those_that_diffusers_makes
 
 def test_clip_shape_is_the_models_own_or_as_many_frames_as_asked(tiny, prior):
     assert prior.clip_shape == (9, 32, 48)
-    assert VideoPrior.load(tiny, frames=17).clip_shape == (17, 32, 48)
+    assert CogVideoXPrior.load(tiny, frames=17).clip_shape == (17, 32, 48)
     with pytest.raises(ValueError, match=r"4k \+ 1 frames, found 10; use 9 or 13"):
-        VideoPrior.load(tiny, frames=10)
+        CogVideoXPrior.load(tiny, frames=10)
 
 
 def test_latents_are_the_scaled_mean_of_the_vae_and_differentiable(prior):
@@ -117,7 +114,7 @@ def test_latents_are_the_scaled_mean_of_the_vae_and_differentiable(prior):
 
 def test_checkpointing_changes_memory_not_gradients(tiny, prior):
     clip = torch.rand(9, 3, 32, 48)
-    thrifty = VideoPrior.load(tiny, checkpointing=True)
+    thrifty = CogVideoXPrior.load(tiny, checkpointing=True)
     gradients, kept = zip(*(there_and_back(which, clip) for which in (prior, thrifty)), strict=True)
     assert torch.equal(gradients[0], gradients[1])
     assert kept[1] < 0.5 * kept[0]
@@ -125,7 +122,7 @@ def test_checkpointing_changes_memory_not_gradients(tiny, prior):
 
 @pytest.mark.parametrize(("checkpointing", "times"), [(False, 1), (True, 2)])
 def test_checkpointing_computes_every_resnet_a_second_time_and_not_a_third(tiny, checkpointing, times):
-    prior = VideoPrior.load(tiny, checkpointing=checkpointing)
+    prior = CogVideoXPrior.load(tiny, checkpointing=checkpointing)
     calls = {}
     for name, module in prior.vae.encoder.named_modules():
         if type(module).__name__ == "CogVideoXResnetBlock3D":
@@ -160,15 +157,16 @@ def test_a_clip_of_the_wrong_shape_is_refused(prior, shape, message):
 
 def test_texts_are_encoded_once_and_the_text_encoder_is_not_loaded_again(tiny, monkeypatch, tmp_path):
     monkeypatch.setenv("PGSD_CACHE", str(tmp_path))
-    first = VideoPrior.load(tiny).encode_prompt([PROMPT, NEGATIVE, PROMPT])
+    first = CogVideoXPrior.load(tiny).encode_prompt([PROMPT, NEGATIVE, PROMPT])
     assert first.shape == (3, 12, 16) and torch.equal(first[0], first[2]) and not torch.equal(first[0], first[1])
     monkeypatch.setattr("transformers.T5EncoderModel.from_pretrained", lambda *_, **__: pytest.fail("loaded again"))
-    assert torch.equal(VideoPrior.load(tiny).encode_prompt([NEGATIVE, PROMPT]), first[[1, 0]])
+    assert torch.equal(CogVideoXPrior.load(tiny).encode_prompt([NEGATIVE, PROMPT]), first[[1, 0]])
 
 
 def test_another_text_encoder_does_not_get_the_cached_embeddings(tiny, tmp_path):
     other = write_tiny(tmp_path / "other", seed=7)
-    assert not torch.equal(VideoPrior.load(tiny).encode_prompt([PROMPT]), VideoPrior.load(other).encode_prompt([PROMPT]))
+    found = [CogVideoXPrior.load(place).encode_prompt([PROMPT]) for place in (tiny, other)]
+    assert not torch.equal(*found)
 
 
 def test_bare_sentencepiece_model_as_cogvideox_ships_it(tmp_path, monkeypatch):
@@ -200,7 +198,7 @@ def test_one_text_alone_is_refused(prior):
 
 def test_missing_folder_is_one_sentence():
     with pytest.raises(PriorError, match="there is no local folder /no/such/prior; give a diffusers CogVideoX folder"):
-        VideoPrior.load("/no/such/prior")
+        CogVideoXPrior.load("/no/such/prior")
 
 
 def test_hub_id_without_network_is_one_sentence(monkeypatch):
@@ -209,7 +207,7 @@ def test_hub_id_without_network_is_one_sentence(monkeypatch):
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", offline)
     with pytest.raises(PriorError) as raised:
-        VideoPrior.load("nobody/no-such-model")
+        CogVideoXPrior.load("nobody/no-such-model")
     assert str(raised.value) == (
         "there is no local folder nobody/no-such-model, and it could not be downloaded from the Hugging Face hub: "
         "Name or service not known"
@@ -219,19 +217,19 @@ def test_hub_id_without_network_is_one_sentence(monkeypatch):
 def test_bundled_prior_without_weights_says_how_to_make_them(monkeypatch, tmp_path):
     monkeypatch.setattr(folder, "BUNDLED", tmp_path)
     with pytest.raises(PriorError, match=r"python scripts/train_bundled_prior\.py"):
-        VideoPrior.load("bundled")
+        CogVideoXPrior.load("bundled")
 
 
 def test_a_file_is_no_folder(tiny):
     with pytest.raises(PriorError, match=r"model_index\.json is a file"):
-        VideoPrior.load(tiny / "model_index.json")
+        CogVideoXPrior.load(tiny / "model_index.json")
 
 
 def test_missing_parts_are_named(broken):
     shutil.rmtree(broken / "vae")
     shutil.rmtree(broken / "tokenizer")
     with pytest.raises(PriorError, match="is not a diffusers CogVideoX folder: it lacks vae, tokenizer"):
-        VideoPrior.load(broken)
+        CogVideoXPrior.load(broken)
 
 
 @pytest.mark.parametrize(
@@ -249,20 +247,20 @@ def test_missing_parts_are_named(broken):
 def test_another_kind_of_model_is_refused(broken, file, changes, message):
     rewrite(broken / file, **changes)
     with pytest.raises(PriorError, match=message):
-        VideoPrior.load(broken)
+        CogVideoXPrior.load(broken)
 
 
 def test_missing_and_damaged_weights_are_named(broken):
     weights = broken / "transformer" / "diffusion_pytorch_model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
     with pytest.raises(PriorError, match="could not be loaded"):
-        VideoPrior.load(broken)
+        CogVideoXPrior.load(broken)
     weights.unlink()
     with pytest.raises(PriorError, match=r"transformer holds no \*\.safetensors weights; download"):
-        VideoPrior.load(broken)
+        CogVideoXPrior.load(broken)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="only where there is no CUDA device")
 def test_cuda_is_refused_where_there_is_none(tiny):
     with pytest.raises(PriorError, match="no CUDA device was found; use the device cpu"):
-        VideoPrior.load(tiny, "cuda")
+        CogVideoXPrior.load(tiny, "cuda")
