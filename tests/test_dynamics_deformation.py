@@ -48,8 +48,8 @@ def test_particles_are_spread_evenly_over_the_box_and_fly_in_all_frames():
 def test_untrained_nothing_moves_and_the_look_is_the_initial_one_bit_for_bit():
     roll = cloud()
     active, every = roll.look.active, torch.arange(50)
-    for rolled in roll.window(0, len(roll)):
-        g = rolled.gaussians
+    for instant in roll.window(0, len(roll)):
+        g = instant.gaussians
         truth = (roll.history.positions_at(0, every), roll.history.quats, active.scales, active.opacity, active.rgb)
         assert all(torch.equal(getattr(g, name), value) for name, value in zip(FIELDS, truth, strict=True))
 
@@ -58,10 +58,10 @@ def test_untrained_nothing_moves_and_the_look_is_the_initial_one_bit_for_bit():
 def test_no_weights_lead_beyond_the_bounds(weights):
     roll = cloud(weights)
     largest = 0.5 * (BOX[1] - BOX[0]) + 1e-5
-    for rolled in roll.window(0, len(roll)):
-        g = rolled.gaussians
+    for instant in roll.window(0, len(roll)):
+        g = instant.gaussians
         g.check_finite()
-        assert (rolled.offset.abs() <= largest).all()
+        assert (instant.offset.abs() <= largest).all()
         assert (g.scales <= 8.001 * roll.look.active.scales).all() and (g.scales >= roll.look.active.scales / 8.001).all()
         assert (g.opacities >= 0).all() and (g.opacities <= 1).all() and (g.colors >= 0).all() and (g.colors <= 1).all()
         torch.testing.assert_close(g.quats.norm(dim=1), torch.ones(50), rtol=0, atol=1e-5)
@@ -78,12 +78,12 @@ def test_reach_is_a_share_of_the_box():
 def test_a_frame_does_not_depend_on_how_it_is_reached():
     roll = cloud(0.3)
     visible = torch.arange(50) % 3 == 0
-    for rolled, some in zip(roll.window(17, 9), roll.window(17, 9, visible=visible), strict=True):
+    for instant, some in zip(roll.window(17, 9), roll.window(17, 9, visible=visible), strict=True):
         for name in FIELDS:
-            here = getattr(rolled.gaussians, name)
-            torch.testing.assert_close(getattr(roll.gaussians(rolled.frame), name), here, rtol=0, atol=1e-6)
+            here = getattr(instant.gaussians, name)
+            torch.testing.assert_close(getattr(roll.gaussians(instant.frame), name), here, rtol=0, atol=1e-6)
             torch.testing.assert_close(getattr(some.gaussians, name), here[visible], rtol=0, atol=1e-6)
-        assert torch.equal(rolled.gaussians.means, rolled.offset + roll.history.positions_at(0, rolled.active))
+        assert torch.equal(instant.gaussians.means, instant.offset + roll.history.positions_at(0, instant.active))
     assert roll.gaussians(17).means.sub(roll.gaussians(25).means).abs().max() > 0.01
 
 
@@ -91,9 +91,9 @@ def test_deltas_add_up_to_what_has_changed():
     roll = cloud(0.1)
     first, *rest = roll.window(10, 9)
     assert roll.window(0, 2)[0].deltas is None and first.deltas is not None
-    moved = sum(rolled.deltas.active.velocity for rolled in rest)
+    moved = sum(instant.deltas.active.velocity for instant in rest)
     torch.testing.assert_close(rest[-1].offset - first.offset, moved, rtol=0, atol=1e-5)
-    bright = sum(rolled.deltas.active.change.rgb for rolled in rest)
+    bright = sum(instant.deltas.active.change.rgb for instant in rest)
     torch.testing.assert_close(rest[-1].gaussians.colors - first.gaussians.colors, bright, rtol=0, atol=1e-5)
 
 
@@ -129,6 +129,10 @@ def test_clips_and_frames_outside_are_refused_and_nan_is_named():
         roll.window(35, 9)
     with pytest.raises(IndexError, match="frames 0 to 39, asked for 40"):
         roll.gaussians(40)
+    with pytest.raises(IndexError, match="frames 0 to 39, asked for 40"):
+        list(roll.frames(38, 41))
+    with pytest.raises(ValueError, match="at least one frame, got gradient_frames = 0"):
+        roll.window(5, 3, gradient_frames=0)
     with torch.no_grad():
         roll.deformation.net.heads["scale"].bias.fill_(math.nan)
     with pytest.raises(FloatingPointError, match=r"frame 11 of the roll-out: \d+ values of the Gaussians' scales"):

@@ -61,8 +61,8 @@ def test_untrained_is_the_simulation_bit_for_bit_under_every_option(motion, conf
     for begin, gradient_frames in (("rollout", None), ("simulation", 1), ("rollout", 3)):
         # With gradient nothing is skipped: networks and grid are evaluated, and their zeros must change no bit.
         clip = roll.window(8, 12, begin=begin, gradient_frames=gradient_frames)
-        for rolled in clip:
-            assert_is_simulation(roll, rolled.gaussians, rolled.frame)
+        for instant in clip:
+            assert_is_simulation(roll, instant.gaussians, instant.frame)
         terms = regularization(clip, roll.learned_look)
         assert all(abs(float(value.detach())) < 1e-6 for value in terms.values())
         assert drift(clip) == 0.0
@@ -112,38 +112,38 @@ def test_random_weights_stay_bounded_for_500_frames(times, motion, appearance):
         assert roll._flow is not None
         elsewhere = (roll._flow.values.amax(dim=1) - roll._flow.values.amin(dim=1)).amax(dim=0)
         assert elsewhere[0] > 0.01
-    for rolled in roll.afresh([*range(0, 500, 20), 249, 499]):
-        g = rolled.gaussians
+    for instant in roll.afresh([*range(0, 500, 20), 249, 499]):
+        g = instant.gaussians
         g.check_finite()
-        ids = torch.cat([rolled.active, rolled.resting])
-        largest = torch.cat([first.active.scales[rolled.active], first.collided.scales[rolled.resting]])
+        ids = torch.cat([instant.active, instant.collided])
+        largest = torch.cat([first.active.scales[instant.active], first.collided.scales[instant.collided]])
         assert (g.scales <= 8.001 * largest.maximum(first.active.scales[ids])).all() and (g.scales > 0).all()
         assert (g.opacities >= 0).all() and (g.opacities <= 1).all() and (g.colors >= 0).all() and (g.colors <= 1).all()
-        age = (rolled.frame - history.births[rolled.active])[:, None]
-        assert (rolled.offset.abs() <= 1.00001 * (bounds.velocity + elsewhere) * age + 1e-6).all()
+        age = (instant.frame - history.births[instant.active])[:, None]
+        assert (instant.offset.abs() <= 1.00001 * (bounds.velocity + elsewhere) * age + 1e-6).all()
         torch.testing.assert_close(g.quats.norm(dim=1), torch.ones(len(g)), rtol=0, atol=1e-4)
 
 
 def test_without_rotation_nothing_turns_and_there_is_no_head_for_it():
     roll = with_options(falling(), config=FieldConfig(rotation=False), weights=1.0)
     assert "rotation" not in roll.field.active_net.heads and "velocity" in roll.field.active_net.heads
-    for rolled in roll.window(8, 20):
-        assert torch.equal(rolled.quats, roll.history.quats[rolled.active])
-        assert rolled.offset.abs().max() > 0
+    for instant in roll.window(8, 20):
+        assert torch.equal(instant.quats, roll.history.quats[instant.active])
+        assert instant.offset.abs().max() > 0
     assert abs(float(regularization(roll.window(8, 20))["rot"].detach())) < 1e-6
 
 
 def test_shared_appearance_changes_all_particles_of_a_state_alike_and_differently_in_every_frame():
     roll = with_options(falling(), config=FieldConfig(appearance="shared"), weights=1.0)
     clip = roll.window(10, 5, begin="simulation")
-    for state in ("active", "resting"):
-        changes = [rolled.deltas.active.change if state == "active" else rolled.deltas.resting for rolled in clip]
+    for state in ("active", "collided"):
+        changes = [instant.deltas.active.change if state == "active" else instant.deltas.collided for instant in clip]
         for change in changes:
             for value in change:
                 assert len(value) > 1 and torch.equal(value, value[:1].expand_as(value)) and value.abs().max() > 0
         assert len({float(change.opacity[0].detach()) for change in changes}) == len(changes)
     first = clip[0].deltas
-    assert not torch.equal(first.active.change.rgb[0], first.resting.rgb[0])
+    assert not torch.equal(first.active.change.rgb[0], first.collided.rgb[0])
     assert with_options(falling(), weights=1.0).window(10, 1)[0].deltas.active.change.opacity.std() > 0
 
 
@@ -153,14 +153,14 @@ def test_fixed_appearance_is_the_initial_look_whatever_is_learned():
     assert roll.learned_look is not None
     with torch.no_grad():
         roll.learned_look.active.fill_(0.5)
-    for rolled in roll.window(10, 9):
-        flying = roll.look.active.select(rolled.active)
-        n = len(rolled.active)
-        assert torch.equal(rolled.gaussians.scales[:n], flying.scales)
-        assert torch.equal(rolled.gaussians.opacities[:n], flying.opacity)
-        lying = roll.look.collided_at(history, rolled.frame, rolled.resting)
-        assert torch.equal(rolled.gaussians.colors[n:], lying.rgb)
-        assert rolled.offset.abs().max() > 0
+    for instant in roll.window(10, 9):
+        flying = roll.look.active.select(instant.active)
+        n = len(instant.active)
+        assert torch.equal(instant.gaussians.scales[:n], flying.scales)
+        assert torch.equal(instant.gaussians.opacities[:n], flying.opacity)
+        lying = roll.look.collided_at(history, instant.frame, instant.collided)
+        assert torch.equal(instant.gaussians.colors[n:], lying.rgb)
+        assert instant.offset.abs().max() > 0
     assert [name for name in roll.field.active_net.heads] == ["velocity", "rotation"]
     assert len(roll.field.collided_net.heads) == 0 and len(roll.field.shared_nets) == 0
 
@@ -194,14 +194,14 @@ def test_truncated_gradient_is_the_sum_of_the_paths_that_are_left(motion, k):
     roll = double(with_options(falling(count=30), motion, weights=0.05))
     roll.motion, start, frames = motion, 14, 6
 
-    def value(rolled):
-        return torch.stack([getattr(rolled.gaussians, name).sin().sum() for name in FIELDS]).sum()
+    def value(instant):
+        return torch.stack([getattr(instant.gaussians, name).sin().sum() for name in FIELDS]).sum()
 
     clip = roll.window(start, frames, begin="simulation", gradient_frames=k)
     found = torch.autograd.grad(torch.stack([value(r) for r in clip]).sum(), list(roll.field.parameters()))
 
     fields = [deepcopy(roll.field) for _ in range(frames)]
-    state, look = simulated(roll.history, start - 1), roll._learned()
+    state, look = simulated(roll.history, start - 1), roll._present_look()
     truth = [torch.zeros_like(p) for p in roll.field.parameters()]
     for t in range(frames):
         state, deltas = advance(state, roll.history, look, fields[t], None, roll._flow)
@@ -280,9 +280,9 @@ def test_gap_is_zero_untrained_and_without_clips():
 def test_frames_afresh_are_those_of_a_roll_out_that_has_kept_nothing():
     roll, other = rollout(falling(), weights=0.3), rollout(falling(), weights=0.3)
     found = list(roll.afresh([30, 3, 17]))
-    assert [rolled.frame for rolled in found] == [3, 17, 30] and not roll._keyframes
-    for rolled in found:
-        torch.testing.assert_close(rolled.gaussians.means, other.gaussians(rolled.frame).means, rtol=0, atol=2e-6)
+    assert [instant.frame for instant in found] == [3, 17, 30] and not roll._keyframes
+    for instant in found:
+        torch.testing.assert_close(instant.gaussians.means, other.gaussians(instant.frame).means, rtol=0, atol=2e-6)
     with pytest.raises(IndexError, match="frames 0 to 39, asked for 40"):
         deque(roll.afresh([40]))
 
@@ -292,9 +292,9 @@ def test_by_field_a_frame_does_not_depend_on_how_it_is_reached():
     whole, other = list(roll.afresh(range(17, 26))), with_options(enduring(), weights=0.3)
     visible = torch.arange(30) % 3 == 0
     clips = zip(roll.window(17, 9), roll.window(17, 9, visible=visible), whole, strict=True)
-    for rolled, some, afresh in clips:
-        here = rolled.gaussians.means
-        torch.testing.assert_close(roll.gaussians(rolled.frame).means, here, rtol=0, atol=1e-5)
+    for instant, some, afresh in clips:
+        here = instant.gaussians.means
+        torch.testing.assert_close(roll.gaussians(instant.frame).means, here, rtol=0, atol=1e-5)
         torch.testing.assert_close(afresh.gaussians.means, here, rtol=0, atol=1e-5)
         torch.testing.assert_close(some.gaussians.means, here[visible], rtol=0, atol=1e-5)
-        assert (other.gaussians(rolled.frame).means - here).abs().max() > 0.01
+        assert (other.gaussians(instant.frame).means - here).abs().max() > 0.01

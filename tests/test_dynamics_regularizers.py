@@ -93,11 +93,11 @@ def test_terms_are_means_over_gaussians_and_frames():
         assert terms[f"{state}_opacity"] == pytest.approx(bounds.opacity * small, rel=1e-3)
         assert terms[f"{state}_scale"] == pytest.approx(bounds.log_scale * small, rel=1e-3)
         assert terms[f"{state}_rgb"] == pytest.approx(bounds.rgb * large, rel=1e-3)
-    ages = [rolled.frame - history.births[rolled.active] for rolled in clip]
+    ages = [instant.frame - history.births[instant.active] for instant in clip]
     every = torch.cat(ages).float()
     assert terms["rot"] == pytest.approx(float((every * bounds.rotation * small).mean()), rel=1e-3)
     assert terms["xyz"] == pytest.approx(
-        float(torch.cat([rolled.offset.detach().norm(dim=1) for rolled in clip]).mean()), rel=1e-3
+        float(torch.cat([instant.offset.detach().norm(dim=1) for instant in clip]).mean()), rel=1e-3
     )
     assert terms["look"] == pytest.approx(0.5, rel=0.05)
 
@@ -110,16 +110,16 @@ def test_squares_are_means_of_the_squares_of_what_the_norms_measure():
     clip = roll.window(10, 5)
     terms = regularization(clip, roll.learned_look, "squares")
     assert terms.keys() == regularization(clip, roll.learned_look).keys()
-    stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
+    stepped = [instant.deltas for instant in clip if instant.deltas is not None]
 
     def mean(parts):
         return float(torch.cat([part.detach().reshape(len(part), -1).square().sum(1) for part in parts]).mean())
 
     truth = {
-        "xyz": mean(rolled.offset for rolled in clip),
+        "xyz": mean(instant.offset for instant in clip),
         "vel": mean(deltas.active.velocity for deltas in stepped),
         "active_scale": mean(deltas.active.change.log_scale for deltas in stepped),
-        "collided_rgb": mean(deltas.resting.rgb for deltas in stepped),
+        "collided_rgb": mean(deltas.collided.rgb for deltas in stepped),
         "look": sum(float(x.detach().square().sum()) for shift in roll.learned_look.bounded() for x in shift),
     }
     for name, value in truth.items():

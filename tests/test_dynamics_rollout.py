@@ -19,11 +19,11 @@ FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 def assert_is_simulation(roll, gaussians, frame):
     history, look = roll.history, roll.look
-    active, resting = history.active(frame), history.resting(frame)
-    flying, lying = look.active.select(active), look.collided_at(history, frame, resting)
+    active, collided = history.active(frame), history.resting(frame)
+    flying, lying = look.active.select(active), look.collided_at(history, frame, collided)
     truth = {
-        "means": torch.cat([history.positions_at(frame, active), history.rest_positions[resting]]),
-        "quats": torch.cat([history.quats[active], history.rest_quats[resting]]),
+        "means": torch.cat([history.positions_at(frame, active), history.rest_positions[collided]]),
+        "quats": torch.cat([history.quats[active], history.rest_quats[collided]]),
         "scales": torch.cat([flying.scales, lying.scales]),
         "opacities": torch.cat([flying.opacity, lying.opacity]),
         "colors": torch.cat([flying.rgb, lying.rgb]),
@@ -37,8 +37,8 @@ def test_untrained_field_reproduces_the_simulation_bit_for_bit():
     for frame in range(len(roll)):
         assert_is_simulation(roll, roll.gaussians(frame), frame)
     # With gradient nothing is skipped: the networks run, and their zeros must change no bit.
-    for rolled in roll.window(0, len(roll)):
-        assert_is_simulation(roll, rolled.gaussians, rolled.frame)
+    for instant in roll.window(0, len(roll)):
+        assert_is_simulation(roll, instant.gaussians, instant.frame)
 
 
 def test_an_open_shutter_shows_how_far_each_particle_flies_in_that_time():
@@ -109,12 +109,12 @@ def plain_loop(roll, particle):
 def test_rollout_follows_the_papers_equations_particle_by_particle():
     roll = double(rollout(falling(count=25), weights=0.3))
     truth = {particle: plain_loop(roll, particle) for particle in range(25)}
-    for rolled in roll.frames():
-        ids = torch.cat([rolled.active, rolled.resting]).tolist()
-        assert sorted(ids) == sorted(p for p in truth if rolled.frame in truth[p])
+    for instant in roll.frames():
+        ids = torch.cat([instant.active, instant.collided]).tolist()
+        assert sorted(ids) == sorted(p for p in truth if instant.frame in truth[p])
         for row, particle in enumerate(ids):
-            x, quat, look = truth[particle][rolled.frame]
-            g = rolled.gaussians
+            x, quat, look = truth[particle][instant.frame]
+            g = instant.gaussians
             torch.testing.assert_close(g.means[row], x[0], rtol=0, atol=1e-10)
             assert abs(float((g.quats[row] * quat[0]).sum())) == pytest.approx(1.0, abs=1e-9)
             torch.testing.assert_close(g.opacities[row], look.opacity[0], rtol=0, atol=1e-10)
@@ -128,19 +128,19 @@ def test_window_equals_random_access(stride):
     everything = list(roll.frames())
     for start in (0, 1, 13, len(roll) - 9):
         roll._last = None
-        for rolled in roll.window(start, 9):
+        for instant in roll.window(start, 9):
             for name in FIELDS:
-                there, here = getattr(everything[rolled.frame].gaussians, name), getattr(rolled.gaussians, name)
+                there, here = getattr(everything[instant.frame].gaussians, name), getattr(instant.gaussians, name)
                 torch.testing.assert_close(here, there, rtol=0, atol=2e-6)
-            torch.testing.assert_close(roll.gaussians(rolled.frame).means, rolled.gaussians.means, rtol=0, atol=2e-6)
+            torch.testing.assert_close(roll.gaussians(instant.frame).means, instant.gaussians.means, rtol=0, atol=2e-6)
 
 
 def test_only_visible_particles_are_evaluated_and_they_are_the_same():
     roll = rollout(falling(), weights=0.1)
     visible = torch.arange(len(roll.history)) % 3 == 0
     for some, every in zip(roll.window(12, 9, visible=visible), roll.window(12, 9), strict=True):
-        ids = torch.cat([every.active, every.resting])
-        assert torch.equal(torch.cat([some.active, some.resting]), ids[visible[ids]])
+        ids = torch.cat([every.active, every.collided])
+        assert torch.equal(torch.cat([some.active, some.collided]), ids[visible[ids]])
         for name in FIELDS:
             torch.testing.assert_close(
                 getattr(some.gaussians, name), getattr(every.gaussians, name)[visible[ids]], rtol=0, atol=2e-6
@@ -233,4 +233,4 @@ def test_no_particles_at_all_are_no_error():
     history = falling()
     visible = torch.zeros(len(history), dtype=torch.bool)
     clip = rollout(history, weights=0.1).window(5, 4, visible=visible)
-    assert [len(rolled.gaussians) for rolled in clip] == [0, 0, 0, 0]
+    assert [len(instant.gaussians) for instant in clip] == [0, 0, 0, 0]

@@ -5,8 +5,9 @@ from pgsd_nerfstudio.dynamics.drift import Gap, drift, gaps
 from pgsd_nerfstudio.dynamics.field import DeltaBounds, DynamicsField, FieldConfig
 from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.dynamics.regularizers import RegularizationWeights, regularization
-from pgsd_nerfstudio.dynamics.rollout import Begin, Motion, Rollout
+from pgsd_nerfstudio.dynamics.rollout import Motion, Rollout
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
+from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "DynamicsField",
     "FieldConfig",
     "Gap",
+    "GaussianSequence",
     "LearnedLook",
     "Motion",
     "RegularizationWeights",

@@ -9,7 +9,6 @@ and are to be left out (RegularizationWeights.without) for the ablation as publi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,8 +20,8 @@ from torch import Tensor, nn
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
-from pgsd_nerfstudio.dynamics.rollout import Begin, Progress
-from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_finite, check_frame, check_window
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
+from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
 from pgsd_nerfstudio.dynamics.state import Deltas, turned
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -103,11 +102,8 @@ class _Deformed(NamedTuple):
     change: Change
 
 
-class DeformedCloud:
-    """Scattered Gaussians over time, at random access and in windows with gradient, like a Rollout. Everything is in metres."""
-
-    stale = False
-    """Nothing is kept, so nothing is ever out of date."""
+class DeformedCloud(GaussianSequence):
+    """Scattered Gaussians that a network of place and time moves, without recurrence."""
 
     def __init__(
         self, history: ParticleHistory, look: InitialLook, deformation: Deformation, learned_look: LearnedLook | None = None
@@ -123,71 +119,44 @@ class DeformedCloud:
                 f"a deformed cloud has neither births nor landings, but {int((~flying).sum())} of {len(history)} particles are "
                 f"not in the air in all {history.frames} frames"
             )
-        self.history, self.look, self.deformation, self.learned_look = history, look, deformation, learned_look
+        super().__init__(history, look, learned_look)
+        self.deformation = deformation
 
-    def __len__(self) -> int:
-        """Number of frames."""
-        return self.history.frames
+    @property
+    def stale(self) -> bool:
+        """False: without recurrence no state is kept that could be out of date."""
+        return False
 
     def refresh(self, progress: Progress | None = None) -> None:
-        """Nothing to do: without recurrence no state has to be kept."""
+        """Does nothing: without recurrence no state has to be kept."""
 
-    @torch.no_grad()
-    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None) -> Gaussians:
-        """The Gaussians of any frame, without gradient.
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutFrame:
+        return self._rendered(frame, self._deformed(frame, visible, look), None, look)
 
-        Raises:
-            IndexError: there is no such frame.
-        """
-        check_frame(frame, len(self))
-        return self._rendered(frame, self._at(frame, visible), None).gaussians
-
-    @torch.no_grad()
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolloutFrame]:
-        """Frames start .. stop (exclusive) one after the other, without gradient."""
-        for frame in range(start, len(self) if stop is None else stop):
-            yield self._rendered(frame, self._at(frame, None), None)
-
-    def window(
-        self,
-        start: int,
-        frames: int,
-        *,
-        visible: Bool[Tensor, " p"] | None = None,
-        begin: Begin = "rollout",
-        gradient_frames: int | None = None,
+    def _clip(
+        self, start: int, frames: int, visible: Bool[Tensor, " p"] | None, begin: Begin, gradient_frames: int | None
     ) -> list[RolloutFrame]:
-        """A clip with gradient to network and learned look.
-
-        `begin` and `gradient_frames` speak of a recurrence and do nothing here. Deltas are the differences to the frame
-        before, so that the appearance terms of the loss mean what they do elsewhere.
-
-        Raises:
-            IndexError: the clip leaves the sequence.
-            FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
-        """
-        check_window(start, frames, len(self))
-        before, clip = self._at(start - 1, visible) if start else None, []
+        """Without recurrence `begin` and `gradient_frames` do nothing. Deltas are the differences to the frame before, so that
+        the appearance terms of the loss mean what they do elsewhere."""
+        # The learned look is worked out anew at each use: one for the whole clip would add up its gradient in another order,
+        # and trainings would not repeat to the bit.
+        before, clip = self._deformed(start - 1, visible, self._present_look()) if start else None, []
         for frame in range(start, start + frames):
-            now = self._at(frame, visible)
-            clip.append(self._rendered(frame, now, before))
-            check_finite(clip[-1])
+            now = self._deformed(frame, visible, self._present_look())
+            clip.append(self._rendered(frame, now, before, self._present_look()))
             before = now
         return clip
 
-    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None) -> _Deformed:
+    def _deformed(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> _Deformed:
         ids = self.history.active(frame)
         ids = ids if visible is None else ids[visible[ids]]
         moved, rotation, change = self.deformation(self.history.positions_at(0, ids), frame)
-        change = accumulate(self._initial().active.select(ids), Change.none(len(ids), moved), change)
+        change = accumulate(look.active.select(ids), Change.none(len(ids), moved), change)
         return _Deformed(ids, moved, turned(self.history.quats[ids], rotation), change)
 
-    def _initial(self) -> InitialLook:
-        return self.look if self.learned_look is None else self.learned_look(self.look)
-
-    def _rendered(self, frame: int, now: _Deformed, before: _Deformed | None) -> RolloutFrame:
+    def _rendered(self, frame: int, now: _Deformed, before: _Deformed | None, initial: InitialLook) -> RolloutFrame:
         ids, moved, quats, change = now
-        look = changed(self._initial().active.select(ids), change)
+        look = changed(initial.active.select(ids), change)
         places = self.history.positions_at(0, ids) + moved
         gaussians = Gaussians(places, quats, look.scales, look.opacity, look.rgb)
         deltas = None if before is None else _deltas(before, now)

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import torch
 
-from pgsd_nerfstudio.dynamics.rollout import Begin, Rollout
+from pgsd_nerfstudio.dynamics.rollout import Rollout
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
+from pgsd_nerfstudio.dynamics.sequence import Begin
 
 
 def drift(frames: Iterable[RolloutFrame]) -> float:
     """Mean distance in metres of rendered from simulated positions (paper, eq. drift_eq); empty frames do not count."""
-    return _average(_distance(rolled) for rolled in frames)
+    return _average(_distance(instant) for instant in frames)
 
 
 class Gap(NamedTuple):
@@ -45,18 +46,18 @@ def gaps(
         IndexError: a clip leaves the sequence.
     """
     wanted = {start + k for start, frames in windows for k in range(frames)}
-    whole = {rolled.frame: _distance(rolled) for rolled in rollout.afresh(wanted)}
+    whole = {instant.frame: _distance(instant) for instant in rollout.afresh(wanted)}
     found: dict[Begin, Gap] = {}
     for begin in begins:
-        clips = [rolled for start, frames in windows for rolled in rollout.window(start, frames, begin=begin)]
-        seen, shown = _average(_distance(rolled) for rolled in clips), _average(whole[rolled.frame] for rolled in clips)
+        clips = [instant for start, frames in windows for instant in rollout.window(start, frames, begin=begin)]
+        seen, shown = _average(_distance(instant) for instant in clips), _average(whole[instant.frame] for instant in clips)
         found[begin] = Gap(seen, shown, shown - seen)
     return found
 
 
-def _distance(rolled: RolloutFrame) -> float | None:
+def _distance(instant: RolloutFrame) -> float | None:
     """Mean distance in metres of one frame; None where no particle is in the air."""
-    return float(rolled.offset.detach().norm(dim=1).mean()) if len(rolled.active) else None
+    return float(instant.offset.detach().norm(dim=1).mean()) if len(instant.active) else None
 
 
 def _average(distances: Iterable[float | None]) -> float:

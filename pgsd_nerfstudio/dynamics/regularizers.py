@@ -97,17 +97,17 @@ def regularization(
     clip: Sequence[RolloutFrame], learned_look: LearnedLook | None = None, form: Form = "norms"
 ) -> dict[str, Tensor]:
     """The terms of one clip, named and formed as in RegularizationWeights; zero where there is no particle."""
-    stepped = [rolled.deltas for rolled in clip if rolled.deltas is not None]
+    stepped = [instant.deltas for instant in clip if instant.deltas is not None]
     mean = _Mean(clip[0].gaussians.means.new_zeros(()))
     size, turn = (safe_norm, rotation_angle) if form == "norms" else (squared_norm, quaternion_difference)
     terms = {
-        "xyz": mean(size(rolled.offset) for rolled in clip),
+        "xyz": mean(size(instant.offset) for instant in clip),
         "vel": mean(size(deltas.active.velocity) for deltas in stepped),
-        "rot": mean(turn(rolled.quats, rolled.simulated_quats) for rolled in clip),
+        "rot": mean(turn(instant.quats, instant.simulated_quats) for instant in clip),
     }
     for state, changes in (
         ("active", [deltas.active.change for deltas in stepped]),
-        ("collided", [deltas.resting for deltas in stepped]),
+        ("collided", [deltas.collided for deltas in stepped]),
     ):
         terms[f"{state}_opacity"] = mean(size(change.opacity[:, None]) for change in changes)
         terms[f"{state}_scale"] = mean(size(change.log_scale) for change in changes)

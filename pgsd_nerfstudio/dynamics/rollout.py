@@ -9,7 +9,7 @@ and keeps a state every `stride` frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -20,19 +20,18 @@ from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
-from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_finite, check_frame, check_window
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_frame
+from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
 from pgsd_nerfstudio.dynamics.state import Deltas, RolloutState, advance, fading, simulated
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-Progress = Callable[[int, int], None]
-Begin = Literal["rollout", "simulation"]
 Motion = Literal["particle", "field"]
 
 
-class Rollout:
+class Rollout(GaussianSequence):
     """Particles over time, at random access and in windows with gradient. Everything is in metres."""
 
     def __init__(
@@ -59,17 +58,11 @@ class Rollout:
             raise ValueError(f"stride must be at least one frame, got {stride}")
         if motion not in ("particle", "field"):
             raise ValueError(f'motion must be "particle" or "field", got "{motion}"')
-        self.history, self.look, self.field, self.learned_look, self.stride = history, look, field, learned_look, stride
-        self.exposure, self.motion = exposure, motion
+        super().__init__(history, look, learned_look)
+        self.field, self.stride, self.exposure, self.motion = field, stride, exposure, motion
         self._keyframes: dict[int, RolloutState] = {}
         self._stamp: tuple[int, ...] = ()
-        self.refreshed: dict[str, Tensor] | None = None
-        """Weights that the kept states were made with; None before the first `refresh`."""
         self._last: RolloutState | None = None
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return self.history.frames
 
     @property
     def stale(self) -> bool:
@@ -115,24 +108,6 @@ class Rollout:
             part.load_state_dict({k.removeprefix(f"{name}."): v for k, v in weights.items() if k.startswith(f"{name}.")})
 
     @torch.no_grad()
-    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None) -> Gaussians:
-        """The Gaussians of any frame, without gradient; neighbouring frames in ascending order are cheapest.
-
-        Rolls from the kept state before `frame` (made by a first `refresh` if there is none yet, see `stale`).
-
-        Raises:
-            IndexError: there is no such frame.
-        """
-        return self._rendered(self._reach(frame, visible), self._learned(), None).gaussians
-
-    @torch.no_grad()
-    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolloutFrame]:
-        """Frames start .. stop (exclusive) one after the other, without gradient; for rendering and measuring."""
-        look = self._learned()
-        for frame in range(start, len(self) if stop is None else stop):
-            yield self._rendered(self._reach(frame, None), look, None)
-
-    @torch.no_grad()
     def afresh(self, frames: Collection[int]) -> Iterator[RolloutFrame]:
         """These frames in ascending order, rolled from the first of all with the present weights; kept states stay as they are.
 
@@ -142,53 +117,27 @@ class Rollout:
         wanted = set(frames)
         for frame in wanted:
             check_frame(frame, len(self))
-        look, last = self._learned(), max(wanted, default=-1)
+        look, last = self._present_look(), max(wanted, default=-1)
         still = self.field.still()
         for state in (simulated(self.history, frame) for frame in sorted(wanted)) if still else self._walk(last):
             if state.frame in wanted:
                 yield self._rendered(state, look, None)
 
-    def window(
-        self,
-        start: int,
-        frames: int,
-        *,
-        visible: Bool[Tensor, " p"] | None = None,
-        begin: Begin = "rollout",
-        gradient_frames: int | None = None,
+    def _clip(
+        self, start: int, frames: int, visible: Bool[Tensor, " p"] | None, begin: Begin, gradient_frames: int | None
     ) -> list[RolloutFrame]:
-        """A clip with gradient to field and learned look: true recurrence from its first frame to its last.
-
-        Args:
-            start: first frame of the clip.
-            frames: length of the clip.
-            visible: mask over all particles; only these are evaluated. None means all.
-            begin: where the clip starts from: the state that the roll-out reaches at the frame before, or (the paper's code)
-                the simulated one.
-            gradient_frames: after so many steps of the recurrence the gradient is cut, as in truncated backpropagation through
-                time; None lets it run through the whole clip, 1 cuts it after every frame, as the paper's code does.
-
-        Raises:
-            IndexError: the clip leaves the sequence.
-            ValueError: `gradient_frames` is below one.
-            FloatingPointError: a Gaussian is not finite; the message names quantity and frame.
-        """
-        check_window(start, frames, len(self))
-        if gradient_frames is not None and gradient_frames < 1:
-            raise ValueError(f"the gradient must run through at least one frame, got gradient_frames = {gradient_frames}")
+        """True recurrence from the first frame to the last."""
         with torch.no_grad():
             before = max(start - 1, 0)
             reached = begin == "rollout" and start > 0
             state = self._under_way(before, visible) if reached else simulated(self.history, before, visible)
-        look = self._learned()
+        look = self._present_look()
         clip = [self._rendered(state, look, None)] if start == 0 else []
         for step in range(frames - len(clip)):
             if gradient_frames is not None and step % gradient_frames == 0:
                 state = state.detach()
             state, deltas = advance(state, self.history, look, self.field, visible, self._flow)
             clip.append(self._rendered(state, look, deltas))
-        for rolled in clip:
-            check_finite(rolled)
         return clip
 
     @cached_property
@@ -197,27 +146,24 @@ class Rollout:
 
     def _walk(self, last: int) -> Iterator[RolloutState]:
         """The states of frames 0 .. last with the present weights."""
-        look, state = self._learned(), simulated(self.history, 0)
+        look, state = self._present_look(), simulated(self.history, 0)
         yield state
         while state.frame < last:
             state, _ = advance(state, self.history, look, self.field, None, self._flow)
             yield state
 
-    def _learned(self) -> InitialLook:
-        if self.learned_look is None or self.field.config.appearance == "fixed":
-            return self.look
-        if not torch.is_grad_enabled() and not any(bool(p.any()) for p in self.learned_look.parameters()):
-            return self.look
-        return self.learned_look(self.look)
+    def _present_look(self) -> InitialLook:
+        return self.look if self.field.config.appearance == "fixed" else super()._present_look()
 
     def _weights(self) -> tuple[int, ...]:
         """Changes with every in-place update of a weight, also by an optimizer or by loading a state dict."""
-        modules = [self.field, *([self.learned_look] if self.learned_look else [])]
-        return tuple(number for module in modules for p in module.parameters() for number in (id(p), p._version))
+        return tuple(number for part in self._modules().values() for p in part.parameters() for number in (id(p), p._version))
 
-    def _reach(self, frame: int, visible: Bool[Tensor, " p"] | None) -> RolloutState:
-        """The state at a frame, without gradient."""
-        check_frame(frame, len(self))
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutFrame:
+        return self._rendered(self._reach(frame, visible, look), look, None)
+
+    def _reach(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutState:
+        """The state at a frame, without gradient, from the kept state before it (of a first `refresh` if there is none yet)."""
         if self.field.still():
             return simulated(self.history, frame, visible)
         if not self._keyframes:
@@ -226,7 +172,7 @@ class Rollout:
         last = self._last
         if visible is None and last is not None and not self.stale and state.frame <= last.frame <= frame:
             state = last
-        state, look = state.select(visible), self._learned()
+        state = state.select(visible)
         while state.frame < frame:
             state, _ = advance(state, self.history, look, self.field, visible, self._flow)
         if visible is None:
@@ -236,7 +182,6 @@ class Rollout:
     def _under_way(self, frame: int, visible: Bool[Tensor, " p"] | None) -> RolloutState:
         """The state from which a clip starts: what flies as the present weights have moved it since its birth, what lies as the
         last `refresh` saw it."""
-        check_frame(frame, len(self))
         if self.field.still():
             return simulated(self.history, frame, visible)
         flying = self.history.active(frame)
@@ -244,32 +189,33 @@ class Rollout:
             flying = flying[visible[flying]]
         aloft = torch.zeros(len(self.history), dtype=torch.bool, device=flying.device)
         aloft[flying] = True
-        lying = self._reach(frame, ~aloft if visible is None else visible & ~aloft)
+        look = self._present_look()
+        lying = self._reach(frame, ~aloft if visible is None else visible & ~aloft, look)
         if len(flying) == 0:
             return lying
-        few, look = self.history.select(flying), self._learned().select(flying)
+        few, look = self.history.select(flying), look.select(flying)
         state = simulated(few, int(few.births.min()))
         while state.frame < frame:
             state, _ = advance(state, few, look, self.field, None, self._flow)
-        return replace(state, active=flying, resting=lying.resting, resting_change=lying.resting_change)
+        return replace(state, active=flying, collided=lying.collided, collided_change=lying.collided_change)
 
     def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None) -> RolloutFrame:
         history = self.history
         fade = fading(history, state.frame, state.active)
         offset = state.offset * fade[:, None]
         flying = changed(look.active.select(state.active), state.active_change.times(fade))
-        lying = changed(look.collided_at(history, state.frame, state.resting), state.resting_change)
+        lying = changed(look.collided_at(history, state.frame, state.collided), state.collided_change)
         looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(flying), _fields(lying), strict=True)))
         gaussians = Gaussians(
-            torch.cat([history.positions_at(state.frame, state.active) + offset, history.rest_positions[state.resting]]),
-            torch.cat([state.quats, history.rest_quats[state.resting]]),
+            torch.cat([history.positions_at(state.frame, state.active) + offset, history.rest_positions[state.collided]]),
+            torch.cat([state.quats, history.rest_quats[state.collided]]),
             looks.scales,
             looks.opacity,
             looks.rgb,
             self._displacements(state),
         )
         simulated_quats = history.quats[state.active]
-        return RolloutFrame(state.frame, gaussians, state.active, state.resting, offset, state.quats, simulated_quats, deltas)
+        return RolloutFrame(state.frame, gaussians, state.active, state.collided, offset, state.quats, simulated_quats, deltas)
 
     def _displacements(self, state: RolloutState) -> Float[Tensor, "k 3"] | None:
         """Metres while the shutter is open, of all that is rendered; what lies does not move. None where nothing is smeared."""
@@ -277,7 +223,7 @@ class Rollout:
             return None
         per_frame = self.history.displacement_at(state.frame, state.active)
         moved = per_frame * (self.exposure * self.history.fps)
-        return torch.cat([moved, moved.new_zeros(len(state.resting), 3)])
+        return torch.cat([moved, moved.new_zeros(len(state.collided), 3)])
 
 
 def _fields(look: ParticleLook) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,7 +20,7 @@ class RolloutFrame:
     """In metres, plain RGB: the active ones, then the collided ones."""
     active: Int[Tensor, " n"]
     """Ids of the first n Gaussians."""
-    resting: Int[Tensor, " m"]
+    collided: Int[Tensor, " m"]
     """Ids of the other m."""
     offset: Float[Tensor, "n 3"]
     """Rendered minus simulated position, metres."""
@@ -43,9 +43,9 @@ def check_window(start: int, frames: int, total: int) -> None:
         raise IndexError(f"a clip of {frames} frames from frame {start} does not fit into {total} frames")
 
 
-def check_finite(rolled: RolloutFrame) -> None:
+def check_finite(instant: RolloutFrame) -> None:
     """Raises FloatingPointError: a Gaussian is not finite; the message names quantity and frame."""
     try:
-        rolled.gaussians.check_finite()
+        instant.gaussians.check_finite()
     except ValueError as error:
-        raise FloatingPointError(f"frame {rolled.frame} of the roll-out: {error}") from error
+        raise FloatingPointError(f"frame {instant.frame} of the roll-out: {error}") from error

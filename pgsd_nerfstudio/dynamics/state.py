@@ -40,23 +40,23 @@ class RolloutState:
     """Learned part of the position, metres, before it fades for landing."""
     quats: Float[Tensor, "n 4"]
     active_change: Change
-    resting: Int[Tensor, " m"]
+    collided: Int[Tensor, " m"]
     """Ids of the particles that have landed, ascending."""
-    resting_change: Change
+    collided_change: Change
 
     def select(self, visible: Bool[Tensor, " p"] | None) -> RolloutState:
         """Only the visible ones."""
         if visible is None:
             return self
-        a, r = visible[self.active], visible[self.resting]
+        active, collided = visible[self.active], visible[self.collided]
         return RolloutState(
             self.frame,
-            self.active[a],
-            self.offset[a],
-            self.quats[a],
-            Change(*(x[a] for x in self.active_change)),
-            self.resting[r],
-            Change(*(x[r] for x in self.resting_change)),
+            self.active[active],
+            self.offset[active],
+            self.quats[active],
+            Change(*(x[active] for x in self.active_change)),
+            self.collided[collided],
+            Change(*(x[collided] for x in self.collided_change)),
         )
 
     def detach(self) -> RolloutState:
@@ -66,7 +66,7 @@ class RolloutState:
             offset=self.offset.detach(),
             quats=self.quats.detach(),
             active_change=Change(*(x.detach() for x in self.active_change)),
-            resting_change=Change(*(x.detach() for x in self.resting_change)),
+            collided_change=Change(*(x.detach() for x in self.collided_change)),
         )
 
 
@@ -74,12 +74,12 @@ class Deltas(NamedTuple):
     """What the field added in one step: to the particles that were in the air before and still are, and to those that lay."""
 
     active: ActiveDelta
-    resting: Change
+    collided: Change
 
 
 def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, " p"] | None = None) -> RolloutState:
     """The state in which nothing has been learned: simulated positions, initial look."""
-    active, resting = _seen(history.active(frame), visible), _seen(history.resting(frame), visible)
+    active, collided = _seen(history.active(frame), visible), _seen(history.resting(frame), visible)
     like = history.positions
     return RolloutState(
         frame,
@@ -87,8 +87,8 @@ def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, " p"] 
         like.new_zeros(len(active), 3),
         history.quats[active],
         Change.none(len(active), like),
-        resting,
-        Change.none(len(resting), like),
+        collided,
+        Change.none(len(collided), like),
     )
 
 
@@ -128,13 +128,13 @@ def advance(
     flying = look.active.select(ids)
     delta = field.active(here, motion, frame, changed(flying, change.times(fade)))
 
-    laid = history.ends[fresh.resting] < frame
-    rest = fresh.resting[laid]
-    resting = resting_delta = state.resting_change
+    laid = history.ends[fresh.collided] < frame
+    rest = fresh.collided[laid]
+    collided_change = collided_delta = state.collided_change
     if len(rest):
-        lying = changed(look.collided_at(history, state.frame, rest), state.resting_change)
-        resting_delta = field.collided(history.rest_positions[rest], frame, lying)
-        resting = accumulate(look.collided_at(history, frame, rest), state.resting_change, resting_delta)
+        lying = changed(look.collided_at(history, state.frame, rest), state.collided_change)
+        collided_delta = field.collided(history.rest_positions[rest], frame, lying)
+        collided_change = accumulate(look.collided_at(history, frame, rest), state.collided_change, collided_delta)
 
     return RolloutState(
         frame,
@@ -142,9 +142,9 @@ def advance(
         _placed(fresh.offset, stay, offset + delta.velocity),
         _placed(fresh.quats, stay, turned(quats, delta.rotation)),
         _placed_change(fresh.active_change, stay, accumulate(flying, change, delta.change)),
-        fresh.resting,
-        _placed_change(fresh.resting_change, laid, resting),
-    ), Deltas(delta, resting_delta)
+        fresh.collided,
+        _placed_change(fresh.collided_change, laid, collided_change),
+    ), Deltas(delta, collided_delta)
 
 
 def turned(quats: Float[Tensor, "n 4"], rotation: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:

@@ -34,6 +34,7 @@ PAPER = {1.0: 4.32, 1e2: 2.37, 1e4: 1.46, 1e6: 0.03}
 """Average drift by constant weight, in the paper's scene units (its table "Trajectory Drift Ablations")."""
 PAPER_ADAPTIVE = 0.24
 STEPS, RATE, LOOK_RATE = 120, 5e-4, 1e-2
+PARTICLES = 8_000  # active at once, at most: what the figures of drift were always measured with
 """Twice the steps of a run on the CPU at half its rates: an optimizer that goes by steps of one size never holds still, and how
 far it swings about the simulation is in proportion to its rate."""
 CLIPS = 6
@@ -122,13 +123,19 @@ def learned(place: Path, xyz: float | None = None, *, form: Form = "norms", with
     """Train the demo as ns-train does; `xyz` is a constant weight of the position loss in place of all physics guidance."""
     from pgsd_nerfstudio.dynamics import RegularizationWeights, drift
     from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
+    from pgsd_nerfstudio.plugin.options import RunOptions
+    from pgsd_nerfstudio.plugin.training_options import LearningOptions, MotionOptions
+    from pgsd_nerfstudio.weather.options import SceneOptions, SimulationOptions
 
     held: Any = {} if xyz is None else {"xyz": xyz, "constant": ("xyz",)}
     out = without if xyz is None else ("vel", "rot", *without)
-    config = WeatherTrainerConfig(
-        load_scene=Path("demo"), steps=STEPS, lr=RATE, look_lr=LOOK_RATE, output_dir=place, timestamp="bench",
-        regularization=RegularizationWeights(form=form, without=out, **held),
-    )  # fmt: skip
+    run = RunOptions(
+        scene=SceneOptions(load_scene=Path("demo")),
+        simulation=SimulationOptions(max_particles=PARTICLES),
+        motion=MotionOptions(regularization=RegularizationWeights(form=form, without=out, **held)),
+        learning=LearningOptions(steps=STEPS, lr=RATE, look_lr=LOOK_RATE),
+    )
+    config = WeatherTrainerConfig(run=run, output_dir=place, timestamp="bench")
     config.set_timestamp()
     torch.manual_seed(config.machine.seed)
     with redirect_stdout(StringIO()):
@@ -176,8 +183,8 @@ def _clips(pipeline: Any) -> list[Tensor]:
     for index in range(CLIPS):
         cameras, batch = pipeline.datamanager.next_eval(index)
         views, start = from_nerfstudio(cameras), int(batch["start"])
-        rolled = model.rollout.frames(start, start + len(views))
-        weather = [model.prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
+        instants = model.rollout.frames(start, start + len(views))
+        weather = [model.prepared.scene.frame.gaussians_to_scene(instant.gaussians) for instant in instants]
         clips.append(render_clip(model.prepared, views, weather, model.background_color, [None] * len(views)))
     return clips
 
@@ -220,8 +227,8 @@ def _margin(pipeline: Any, clips: list[Tensor]) -> float:
 @torch.no_grad()
 def _wandered(model: Any) -> float:
     """Mean change of colour that the recurrence has summed up in the last frame, against the shared look."""
-    rolled = next(model.rollout.frames(len(model.rollout) - 1))
+    instant = next(model.rollout.frames(len(model.rollout) - 1))
     look = model.look(model.rollout.look)
-    resting = look.collided_at(model.history, rolled.frame, rolled.resting)
-    plain = torch.cat([look.active.select(rolled.active).rgb, resting.rgb])
-    return float((rolled.gaussians.colors - plain).abs().mean())
+    collided = look.collided_at(model.history, instant.frame, instant.collided)
+    plain = torch.cat([look.active.select(instant.active).rgb, collided.rgb])
+    return float((instant.gaussians.colors - plain).abs().mean())

@@ -118,8 +118,8 @@ def _access_error(roll: Rollout) -> float:
     start, worst = len(roll) // 2 + 3, 0.0
     direct = {frame: roll.gaussians(frame) for frame in reversed(range(start, start + CLIP))}
     with torch.no_grad():
-        for rolled in roll.window(start, CLIP):
-            pairs = [(getattr(direct[rolled.frame], name), getattr(rolled.gaussians, name)) for name in FIELDS]
+        for instant in roll.window(start, CLIP):
+            pairs = [(getattr(direct[instant.frame], name), getattr(instant.gaussians, name)) for name in FIELDS]
             worst = max([worst, *(float((a - b).abs().max()) for a, b in pairs)])
     return worst
 
@@ -131,9 +131,9 @@ def _not_finite(roll: Rollout) -> int:
 def _landing_error(roll: Rollout) -> float:
     """Largest learned offset in the last frame in the air, of those that land."""
     worst = 0.0
-    for rolled in roll.frames():
-        landing = roll.history.collided[rolled.active] & (roll.history.ends[rolled.active] == rolled.frame + 1)
-        worst = max([worst, *rolled.offset[landing].abs().flatten().tolist()])
+    for instant in roll.frames():
+        landing = roll.history.collided[instant.active] & (roll.history.ends[instant.active] == instant.frame + 1)
+        worst = max([worst, *instant.offset[landing].abs().flatten().tolist()])
     return worst
 
 

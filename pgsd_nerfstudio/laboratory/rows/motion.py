@@ -120,15 +120,15 @@ def rollout(
 def changed(roll: Rollout, frames: int | None = None) -> int:
     """In all frames, or as many in the middle; with gradient, so that the networks do run."""
     history, look, different = roll.history, roll.look, 0
-    for rolled in roll.window(0, len(roll)) if frames is None else roll.window(len(roll) // 2, frames):
-        flying, lying = look.active.select(rolled.active), look.collided_at(history, rolled.frame, rolled.resting)
-        g = rolled.gaussians
+    for instant in roll.window(0, len(roll)) if frames is None else roll.window(len(roll) // 2, frames):
+        active, collided = look.active.select(instant.active), look.collided_at(history, instant.frame, instant.collided)
+        g = instant.gaussians
         truth = [
-            torch.cat([history.positions_at(rolled.frame, rolled.active), history.rest_positions[rolled.resting]]),
-            torch.cat([history.quats[rolled.active], history.rest_quats[rolled.resting]]),
-            torch.cat([flying.scales, lying.scales]),
-            torch.cat([flying.opacity, lying.opacity]),
-            torch.cat([flying.rgb, lying.rgb]),
+            torch.cat([history.positions_at(instant.frame, instant.active), history.rest_positions[instant.collided]]),
+            torch.cat([history.quats[instant.active], history.rest_quats[instant.collided]]),
+            torch.cat([active.scales, collided.scales]),
+            torch.cat([active.opacity, collided.opacity]),
+            torch.cat([active.rgb, collided.rgb]),
         ]
         different += sum(int((getattr(g, name) != value).sum()) for name, value in zip(FIELDS, truth, strict=True))
     return different

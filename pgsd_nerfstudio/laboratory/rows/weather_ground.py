@@ -211,20 +211,20 @@ def _streaks() -> Iterable[Record]:
     exposure, frame = still.appearance.exposure, 5
     known = torch.from_numpy(rain_fall_speed(run.diameters.double().numpy())) * exposure
     look = initial_look(still, run)
-    rolled = next(Rollout(run, look, DynamicsField.for_history(run), exposure=exposure).frames(frame, frame + 1))
-    gaussians = rolled.gaussians
+    instant = next(Rollout(run, look, DynamicsField.for_history(run), exposure=exposure).frames(frame, frame + 1))
+    gaussians = instant.gaussians
     if gaussians.displacements is None:
         raise ValueError(f"drops must be smeared at an exposure of {exposure:g} s, found none that is")
-    lengths = gaussians.displacements.double().norm(dim=1)[: len(rolled.active)]
-    error = (lengths / known[rolled.active] - 1).abs().max()
+    lengths = gaussians.displacements.double().norm(dim=1)[: len(instant.active)]
+    error = (lengths / known[instant.active] - 1).abs().max()
     beard = f"Beard (1976) times 1/{1 / exposure:.0f} s, {len(lengths)} drops in still air"
     yield Record.judged("rain: length of a drop's streak, worst", 100 * float(error), "%", "<= 10", source=beard)
-    one = int((run.diameters[rolled.active] - 2e-3).abs().argmin())
+    one = int((run.diameters[instant.active] - 2e-3).abs().argmin())
     pixels = _drawn_length(gaussians.select(torch.tensor([one])))
-    due = float(known[rolled.active[one]]) * FOCAL / DISTANCE
+    due = float(known[instant.active[one]]) * FOCAL / DISTANCE
     yield Record.judged(
         "rain: length of a drawn streak", 100 * abs(pixels / due - 1), "%", "<= 10",
-        source=f"{pixels:.1f} of {due:.1f} pixels: a drop of {1e3 * float(run.diameters[rolled.active[one]]):.2g} mm "
+        source=f"{pixels:.1f} of {due:.1f} pixels: a drop of {1e3 * float(run.diameters[instant.active[one]]):.2g} mm "
         f"{DISTANCE:g} m before the lens, root of 12 times the second moment of its brightness along the streak that the "
         "motion adds; speed times exposure times focal length over distance",
     )  # fmt: skip
