@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -98,7 +99,7 @@ class RunState:
         """All arrays by name; `of` reads them back."""
         groups = {"flying": self.flying, "sliding": self.sliding, "dense": self.dense}
         named = {f"{group}.{f.name}": getattr(bodies, f.name) for group, bodies in groups.items() for f in fields(Bodies)}
-        return named | {f"deposits.{name}": value for name, value in self.deposits.items()}
+        return named | with_prefix("deposits.", self.deposits)
 
     @staticmethod
     def of(arrays: Mapping[str, ndarray], born: int, carry: float) -> RunState:
@@ -112,5 +113,23 @@ class RunState:
         flying, sliding, dense = (
             Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in ("flying", "sliding", "dense")
         )
-        deposits = {name.removeprefix("deposits."): value for name, value in arrays.items() if name.startswith("deposits.")}
-        return RunState(flying, sliding, dense, deposits, born, carry)
+        return RunState(flying, sliding, dense, without_prefix("deposits.", arrays), born, carry)
+
+
+T = TypeVar("T")
+
+
+def with_prefix(prefix: str, arrays: Mapping[str, T]) -> dict[str, T]:
+    """The same arrays with a prefix before each name."""
+    return {f"{prefix}{name}": value for name, value in arrays.items()}
+
+
+def without_prefix(prefix: str, arrays: Mapping[str, T]) -> dict[str, T]:
+    """The arrays whose names have a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
+
+
+def random_orientations(key: Sequence[int], count: int) -> Float[ndarray, "n 4"]:
+    """Random unit quaternions (wxyz), uniform over all orientations; `key` seeds them."""
+    quats = np.random.default_rng(key).normal(size=(count, 4))
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.matter import Dense
 from pgsd_nerfstudio.effects.surface_response import SurfaceResponse
-from pgsd_nerfstudio.physics.bodies import Bodies
+from pgsd_nerfstudio.physics.bodies import Bodies, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
@@ -94,8 +94,8 @@ class DenseMatter:
         """The state as arrays, for `restore`; empty where there never was dense matter."""
         if self._mpm is None:
             return {}
-        rows = {f"mpm.{name}": value.numpy(force=True).copy() for name, value in self._mpm.snapshot().items()}
-        return rows | {"dense_ids": self._ids.copy()}
+        rows = {name: value.numpy(force=True).copy() for name, value in self._mpm.snapshot().items()}
+        return with_prefix("mpm.", rows) | {"dense_ids": self._ids.copy()}
 
     def restore(self, arrays: Mapping[str, ndarray]) -> None:
         """Take a state from `snapshot`."""
@@ -103,8 +103,8 @@ class DenseMatter:
             self._mpm, self._ids = None, np.zeros(0, np.int64)
             return
         self._ids = arrays["dense_ids"].copy()
-        rows = {name.removeprefix("mpm."): torch.from_numpy(v.copy()) for name, v in arrays.items() if name.startswith("mpm.")}
-        self._solver().restore(rows)
+        rows = without_prefix("mpm.", arrays)
+        self._solver().restore({name: torch.from_numpy(value.copy()) for name, value in rows.items()})
 
     def _solver(self):
         if self._mpm is None:

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.appearance import REACH, layer_volume
 from pgsd_nerfstudio.effects.effect import Effect
-from pgsd_nerfstudio.physics.bodies import Bodies
+from pgsd_nerfstudio.physics.bodies import Bodies, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
 from pgsd_nerfstudio.physics.ground.dense import DenseMatter
@@ -86,7 +86,7 @@ class Deposits:
         """The state as arrays, for `restore`."""
         arrays = {"missed": np.array([self.missed])}
         if self.cover is not None:
-            arrays |= {f"cover.{name}": value for name, value in self.cover.snapshot().items()}
+            arrays |= with_prefix("cover.", self.cover.snapshot())
         if self.wetness is not None:
             sums = np.array([self.wetness.deposited, self.wetness.evaporated])
             arrays |= {"water": self.wetness.water.copy(), "water_sums": sums}
@@ -98,7 +98,7 @@ class Deposits:
             return
         self.missed = float(arrays["missed"][0])
         if self.cover is not None:
-            self.cover.restore({n.removeprefix("cover."): v for n, v in arrays.items() if n.startswith("cover.")})
+            self.cover.restore(without_prefix("cover.", arrays))
         if self.wetness is not None:
             self.wetness.water = arrays["water"].copy()
             self.wetness.deposited, self.wetness.evaporated = (float(value) for value in arrays["water_sums"])

@@ -1,4 +1,4 @@
-"""The paper's own motion: MPM throughout, in a unit cube, with the published numbers and their artefacts."""
+"""The motion prior of the paper: MPM throughout, in a unit cube, with the published numbers and their artefacts."""
 
 from pgsd_nerfstudio.physics.paper.config import PAPER_EFFECTS, PaperConfig, paper_config
 from pgsd_nerfstudio.physics.paper.run import simulate_paper

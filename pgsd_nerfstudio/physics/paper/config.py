@@ -1,9 +1,9 @@
 """The published numbers of the four effects.
 
-Lengths are edges of the unit cube ("boxes"), axis 2 points up; seconds are those of the solver. From the supplement,
-"Motion Simulation Parameters" and "Implementation Details". Where it is silent the authors' code speaks: E is given in 1e6 Pa,
-density is 1000, the step is 2e-2 dx, a frame is 4 ms, rain and snow start in the upper sixth, fog has the modulus and Poisson's
-ratio below. Nothing there is scaled to the scene: whatever its size, gravity is 9.8 boxes/s^2 and a particle fills a cell.
+Lengths are in edges of the unit cube ("boxes"), axis 2 points up, and seconds are those of the solver. The numbers are from the
+supplement, "Motion Simulation Parameters" and "Implementation Details", and otherwise from the authors' code: E is in 1e6 Pa,
+the density is 1000, the step is 2e-2 dx, a frame is 4 ms, rain and snow start in the upper sixth, and fog has the modulus and
+Poisson's ratio below. Nothing is scaled to the scene: whatever its size, gravity is 9.8 boxes/s^2 and a particle fills a cell.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Material = Literal["snow", "water", "sand"]
 
 DENSITY = 1000.0  # kg/m^3
 PASCAL = 1e6  # of `young`
-SMALLEST_GRID = 32  # nodes per axis: below, the margin of the domain is narrower than the stencil of a particle
+SMALLEST_GRID = 32  # nodes per axis; with fewer, the margin of the domain is narrower than the stencil of a particle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,45 +38,45 @@ class PaperConfig:
     emit: int = 1000
     """Particles per emission."""
     emit_every: int = 2
-    """Frames from one emission to the next; 0: a single one in frame 0."""
+    """Frames from one emission to the next; 0: a single emission in frame 0."""
     region: Literal["above", "side", "volume"] = "above"
-    """Where they start, uniformly: in the upper sixth of the domain, in the sixth at its lower x, or all over it."""
+    """Where particles start, uniformly: in the upper sixth of the domain, in the sixth at its lower x, or in all of it."""
     velocity: tuple[Range, Range, Range]
-    """Bounds of the uniformly drawn initial velocity on each axis, in boxes/s."""
+    """Bounds of the uniformly drawn initial velocity along each axis, in boxes/s."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.8)
     """boxes/s^2."""
     threshold: float = 0.001
-    """Boxes per frame: what moves less is taken to be at rest, wherever it is. 0.25 boxes/s."""
+    """Boxes per frame; a particle that moves less is taken to have collided, wherever it is. The default is 0.25 boxes/s."""
     stationary: Literal["mass", "particles"] = "mass"
-    """How the scene's Gaussians come onto the grid: their mass alone, or as whole particles whose deformation is decomposed and
-    whose momentum of zero is added, as the original does. The motion is the same, the cost is not."""
+    """How the scene's Gaussians are put onto the grid: as mass alone, or as whole particles whose deformation is decomposed and
+    whose momentum of zero is added, as in the original. The motion is the same, the cost is not."""
     near: float = 3.0
-    """Cells from the mesh within which what came to rest is put onto it. Nodes are shared with stationary particles up to 3
-    cells away, so snow stops 1.6 to 2.8 cells above the surface; the paper does not say how near is near."""
+    """Cells from the mesh within which a particle that came to rest is projected onto it. Particles share nodes with stationary
+    particles up to 3 cells away, so snow stops 1.6 to 2.8 cells above the surface; the paper does not give a distance."""
     diameter: float
-    """Metres; what is shown. The solver gives every particle the volume of a cell."""
+    """Metres, for rendering. The solver gives every particle the volume of a cell."""
     frame_seconds: float = 4e-3
     """Simulated seconds from frame to frame."""
     fps: float = 25.0
     """Frames shown per second: 500 frames, 2 s of simulation, take 20 s."""
     cells: int = 64
-    """Cells of the grid per axis; all of them are cleared and visited in every substep."""
+    """Cells of the grid per axis. Every substep clears and visits all of them."""
     step: float = 2e-2
-    """Longest substep in seconds per box of cell width: 0.31 ms, 13 in a frame."""
+    """Longest substep in seconds per box of cell width. The default makes 0.31 ms, 13 substeps in a frame."""
     courant: float = 0.5
-    """Cells that sound and the fastest particle together may travel in a substep; it is shortened where they would go farther.
-    The published step is at 0.25 for snow that has not hardened."""
+    """Cells that sound and the fastest particle together may travel in a substep, which is shortened accordingly. The published
+    step has 0.25 for snow that has not hardened."""
     max_substeps: int = 400
-    """Substeps that one frame may need before it is refused."""
+    """Most substeps of a frame; a frame that needs more is refused."""
     plastic_range: Range = (0.4, 20.0)
-    """Bounds of the plastic volume ratio of snow, and of the volume ratio of water; the upper one also bounds the logarithm of
-    the volume that sand gained. The lower one limits hardening, exp(10 (1 - Jp)), to 403; the paper has no bounds."""
+    """Bounds of the plastic volume ratio of snow and of the volume ratio of water. The upper bound also limits the logarithm of
+    the volume that sand gained; the lower bound limits hardening, exp(10 (1 - Jp)), to 403. The paper has no bounds."""
     surface: SurfaceResponse = field(default_factory=SurfaceResponse)
-    """How landed particles lie; slopes do not matter here, all stay."""
+    """Poses of landed particles. Slopes do not matter here, since all particles stay."""
     precision: Literal["f32", "f64"] = "f32"
-    """Single as in the paper; double is for tests."""
+    """Single precision as in the paper; double precision is for tests."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to run."""
+    """Device of the solver."""
     threads: int = 0
     """Threads on the CPU; 0: all. Sums on the grid are atomic, so only a single thread gives the same bits twice."""
 
@@ -116,7 +116,7 @@ class PaperConfig:
 
     @property
     def particle_volume(self) -> float:
-        """Of each particle, boxes^3: a whole cell, however many share one."""
+        """Volume of each particle, boxes^3: a whole cell, even where particles share a cell."""
         return self.dx**3
 
     @property
@@ -127,14 +127,14 @@ class PaperConfig:
 
     @property
     def sound_speed(self) -> float:
-        """Of matter that is neither strained nor hardened, boxes/s."""
+        """Speed of sound in matter that is neither strained nor hardened, boxes/s."""
         mu, lam = self.moduli
         return math.sqrt((lam + 2 * mu) / DENSITY)
 
     def perturbed(
         self, *, emission: float = 1.0, velocity: float = 1.0, stiffness: float = 1.0, threshold: float = 1.0
     ) -> PaperConfig:
-        """The same with four parameters scaled, as in the paper's test of robustness (0.5 and 1.5).
+        """The same config with four parameters scaled, as in the paper's test of robustness (0.5 and 1.5).
 
         Args:
             emission: factor on the particles per emission.
@@ -207,7 +207,7 @@ def paper_config(effect_name: str) -> PaperConfig:
     """The published numbers of an effect.
 
     Raises:
-        ValueError: the paper has none of that name; the message names those it has.
+        ValueError: the paper has no effect of that name; the message names its effects.
     """
     if effect_name not in PAPER_EFFECTS:
         raise ValueError(f"the paper simulates {', '.join(sorted(PAPER_EFFECTS))}, not {effect_name!r}")

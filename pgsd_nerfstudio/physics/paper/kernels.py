@@ -1,11 +1,11 @@
 """Kernels of the paper's solver: MLS-MPM (Hu et al. 2018) on a dense grid of a unit cube.
 
-What is slow about it is kept on purpose, since it is what gets compared: every node is cleared and visited in every substep,
-particles are scattered with atomics in the order of their birth, stationary ones too, and F is decomposed with `ti.svd`. Snow
-is that of Stomakhin et al. (2013), sand that of Klar et al. (2016) with a volume correction, stress is Kirchhoff's.
+The slow parts of the original are kept, since its cost is measured here: every substep clears and visits every node, particles,
+also stationary ones, are scattered with atomics in the order of their birth, and F is decomposed with `ti.svd`. Snow follows
+Stomakhin et al. (2013), sand Klar et al. (2016) with a volume correction; stress is Kirchhoff's.
 """
 
-# What Taichi compiles is not what Python would run, which is all that a type checker can see.
+# Taichi compiles this code with other types than those that a type checker sees.
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportOptionalCall=false, reportGeneralTypeIssues=false
 
 import taichi as ti
@@ -18,18 +18,19 @@ WIDTH = 25
 NODE = 4  # columns of a node: mass, then momentum (after scattering) or velocity (after `move`)
 SNOW, WATER, SAND = 0, 1, 2
 HARDENING = 10.0  # xi in exp(xi (1 - Jp))
-COMPRESSION, STRETCH = 1 - 2.5e-2, 1 + 4.5e-3  # of a principal direction, beyond which snow yields
+COMPRESSION, STRETCH = 1 - 2.5e-2, 1 + 4.5e-3  # bounds of principal stretches, beyond which snow yields
 FRICTION_DEGREES = 45.0  # of sand
 
 
 @ti.func
 def lowest_node(x, inv_dx):
-    """Lowest of the 3 x 3 x 3 nodes around a position; node (i, j, k) lies at (i, j, k) * dx."""
+    """Lowest of the 3 x 3 x 3 nodes around a position; node (i, j, k) is at (i, j, k) * dx."""
     return ti.cast(ti.floor(x * inv_dx - 0.5), ti.i32)
 
 
 @ti.func
 def row_of(node, cells):
+    """Row of a node in the grid, which has `cells` nodes per axis."""
     return (node[0] * cells + node[1]) * cells + node[2]
 
 
@@ -43,7 +44,15 @@ def clear(grid: Array2):
 
 @ti.kernel
 def scatter_stationary(points: Array2, grid: Array2, count: int, mass: float, cells: int):
-    """Mass of what does not move; it has no momentum and is never deformed."""
+    """Add the mass of stationary particles to the grid; they have no momentum and are never deformed.
+
+    Args:
+        points: [s, 25] rows of the particles; columns 0-2 are positions in boxes.
+        grid: [nodes, 4]; column 0 grows.
+        count: number of particles.
+        mass: of each, kg.
+        cells: nodes per axis.
+    """
     inv_dx = ti.cast(cells, float)
     for p in range(count):
         x = read3(points, p, X)
@@ -56,16 +65,22 @@ def scatter_stationary(points: Array2, grid: Array2, count: int, mass: float, ce
 
 @ti.func
 def sand_projection(values, gained, slope, highest):
-    """Singular values on or inside the Drucker-Prager cone, and the logarithm of the volume gained.
+    """Project singular values onto the Drucker-Prager cone (Klar et al. 2016).
 
     Args:
+        values: [3] singular values of F.
+        gained: logarithm of the volume gained so far.
         slope: (3 lambda + 2 mu) / (2 mu) times the opening of the cone.
+        highest: upper bound of the result's second part.
+
+    Returns:
+        Singular values on or inside the cone, and the new logarithm of the volume gained.
     """
     strain = ti.Vector.zero(float, 3)
     for i in ti.static(range(3)):
         strain[i] = ti.log(ti.max(ti.abs(values[i]), 1e-4))
     trace = strain.sum() + gained
-    back = ti.Vector.one(float, 3)  # pulled apart: without stress
+    back = ti.Vector.one(float, 3)  # no stress where the sand is pulled apart
     left = ti.min(trace, highest)
     if trace < 0.0:
         left = 0.0
@@ -93,7 +108,24 @@ def scatter(
     high: float,
     slope: float,
 ):
-    """Deform the particles by their velocity gradients, then add their mass, momentum and stress to the grid."""
+    """Deform particles by their velocity gradients, then add their mass, momentum and stress to the grid.
+
+    Args:
+        state: [n, 25] rows of the particles; F and the ratio J are changed in place.
+        inside: [n] 1 for particles within the domain; others are skipped.
+        grid: [nodes, 4]; mass and momentum grow.
+        count: number of particles.
+        dt: s.
+        cells: nodes per axis.
+        material: SNOW, WATER or SAND.
+        mu: shear modulus, Pa.
+        lam: first Lamé constant, Pa.
+        volume: of a particle, boxes^3.
+        mass: of a particle, kg.
+        low: lower bound of the ratio J.
+        high: upper bound of the ratio J.
+        slope: see `sand_projection`.
+    """
     inv_dx = ti.cast(cells, float)
     dx = 1.0 / inv_dx
     for p in range(count):
@@ -117,7 +149,7 @@ def scatter(
                 whole = values[0] * values[1] * values[2]
                 stress = hardened * (2.0 * mu * (values - 1.0) * values + lam * whole * (whole - 1.0))
             else:
-                # Only the volume of water matters: F keeps it in one entry, and no shear.
+                # Water has no shear stress, so F keeps the volume ratio in one entry.
                 ratio = ti.min(ti.max(values[0] * values[1] * values[2], low), high)
                 stress += lam * ratio * (ratio - 1.0)
             kept, tau = ti.Matrix.identity(float, 3), ti.Matrix.zero(float, 3, 3)
@@ -151,7 +183,7 @@ def scatter(
 
 @ti.kernel
 def move(grid: Array2, dt: float, gravity_x: float, gravity_y: float, gravity_z: float):
-    """Momentum to velocity, and gravity, at every node."""
+    """Turn momentum into velocity and add gravity (boxes/s^2) over `dt` seconds at every node."""
     pull = dt * ti.Vector([gravity_x, gravity_y, gravity_z])
     for node in range(grid.shape[0]):
         if grid[node, 0] > 0.0:
@@ -173,9 +205,22 @@ def gather(
     stiffness: float,
     density: float,
 ):
-    """Velocities from the grid, then one step of travel; what leaves the bounds stops there and is marked.
+    """Take velocities and their gradients from the grid, then move the particles.
 
-    `signal` becomes the speed of sound plus that of the particle, in boxes/s.
+    A particle that leaves the bounds stops at its first position outside and is marked.
+
+    Args:
+        state: [n, 25] rows of the particles, changed in place.
+        inside: [n] becomes 0 for particles that leave.
+        signal: [n] becomes the speed of sound plus the speed of the particle, boxes/s.
+        grid: [nodes, 4] mass and velocity.
+        bounds: [2, 3] lower and upper corner of the domain, boxes.
+        count: number of particles.
+        dt: s.
+        cells: nodes per axis.
+        material: SNOW, WATER or SAND.
+        stiffness: lambda + 2 mu, Pa.
+        density: kg/m^3.
     """
     inv_dx = ti.cast(cells, float)
     for p in range(count):
@@ -193,7 +238,7 @@ def gather(
                 moment += v.outer_product(ti.Vector([i, j, k]) - offset)
             x += dt * velocity
             for d in ti.static(range(3)):
-                # Whole numbers: a position that is not a number fails this test instead of passing it.
+                # The test uses whole numbers, since NaN fails it then instead of passing it.
                 cell = ti.cast(ti.floor(x[d] * inv_dx), ti.i32)
                 if cell < 1 or cell > cells - 2 or x[d] < bounds[0, d] or x[d] > bounds[1, d]:
                     inside[p] = 0

@@ -1,12 +1,12 @@
-"""The motion prior as the paper makes it: MPM throughout, in a unit cube around the scene.
+"""The motion prior of the paper: MPM throughout, in a unit cube around the scene.
 
     run = simulate_paper(surface, gaussians_in_metres, paper_config("snowfall"), domain)
 
-500 frames of 4 ms are 2 s of simulation; they are shown at 25 fps, so the history lasts 20 s and everything moves ten times
-slower than it was simulated. The artefacts of the published numbers are kept. A single emission falls freely as a whole, but
-its particles soon move as one, since they share cells. In steady snow the newcomers hold back what fell before, to 0.7-0.8 of
-the speed of free fall; floating Gaussians hold it back further. What moves less than 0.25 boxes/s is taken to have collided,
-in mid-air too (`about["hanging"]`): each flake has the volume of a cell, so they pile up before they reach the ground.
+500 frames of 4 ms are 2 s of simulation. They are shown at 25 fps, so the history lasts 20 s and shows the motion ten times
+slower. The artefacts of the published numbers are kept. A single emission falls freely as a whole, but its particles soon move
+as one, since they share cells. In steady snow, new flakes slow down earlier ones to 0.7-0.8 of the speed of free fall; floating
+Gaussians slow them down further. A particle that moves less than 0.25 boxes/s is taken to have collided, in mid-air too
+(`about["hanging"]`): each flake has the volume of a cell, so flakes pile up before they reach the ground.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pgsd_nerfstudio.physics.paper.solver import Box, PaperSolver
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-SIXTH = 1 / 6  # of the domain from which particles start: 0.80-0.95 of a cube that spans 0.05-0.95
+SIXTH = 1 / 6  # share of the domain in which particles start: 0.80-0.95 of a cube that spans 0.05-0.95
 
 
 def simulate_paper(
@@ -45,15 +45,17 @@ def simulate_paper(
     """Simulate an effect with the published numbers.
 
     Args:
-        surface: what particles land on, in metres; may be empty, then they only come to rest.
-        static_points: means of the scene's Gaussians in metres: the obstacles of the paper, which add mass and nothing else.
-        domain: box of air that is mapped into the unit cube, see `Box`.
-        frames: of 4 ms, with the first emission in frame 0.
+        surface: the mesh that particles land on, in metres. On an empty one they collide only by moving slowly.
+        static_points: means of the scene's Gaussians in metres, the obstacles of the paper; they add mass and nothing else.
+        config: the numbers of the effect.
+        domain: the air that is mapped into the unit cube, see `Box`.
+        frames: number of frames of 4 ms, with the first emission in frame 0.
+        seed: of all random numbers.
         progress: show a bar.
 
     Returns:
-        A history in metres at the shown rate, `config.fps`. `about` counts particles emitted, landed (of which hanging: stopped
-        away from the mesh), left, in_air; substeps and the most in a frame; seconds and cpu_seconds.
+        A history in metres at the shown rate, `config.fps`. `about` counts the particles emitted, landed (of which `hanging`
+        stopped away from the mesh), left and in_air, the substeps and the most in a frame, seconds and cpu_seconds.
 
     Raises:
         ValueError: a frame would need too many substeps, or a quantity became NaN or infinite; the message names the frame.
@@ -116,27 +118,27 @@ def _end(
     frame: int,
     rng: np.random.Generator,
 ) -> Int[ndarray, " m"]:
-    """Take out what hit the mesh, left or hardly moved on the way to `frame`; returns the ids that go on."""
+    """End particles that made contact, left or hardly moved since the frame before; returns the ids that stay active."""
     box, now = solver.box, solver.positions
     where = box.to_metres(now)
-    met = record.ground.meet(box.to_metres(before), where)
-    hit = np.zeros(len(ids), bool)
-    hit[met.which] = True
-    where[met.which] = met.points
-    left = ~solver.inside & ~hit
+    contacts = record.ground.meet(box.to_metres(before), where)
+    contact = np.zeros(len(ids), bool)
+    contact[contacts.which] = True
+    where[contacts.which] = contacts.points
+    left = ~solver.inside & ~contact
     slow = np.linalg.norm(now - before, axis=1) < solver.config.threshold
-    stops = hit | (slow & ~left)
+    stops = contact | (slow & ~left)
     record.left(frame, ids[left])
-    # Those that go on get their row of this frame together with the newly emitted ones.
+    # Particles that stay active get their row of this frame together with the new ones.
     record.at(frame, ids[stops], where[stops])
     record.stopped(frame, ids[stops], where[stops], rng.uniform(size=int(stops.sum())))
-    goes_on = ~(left | stops)
-    solver.keep(goes_on)
-    return ids[goes_on]
+    active = ~(left | stops)
+    solver.keep(active)
+    return ids[active]
 
 
 def _in_air(solver: PaperSolver, ids: Int[ndarray, " n"], box: Box, config: PaperConfig) -> Bodies:
-    """What has not ended; it has neither a terminal speed nor flutter."""
+    """The active particles, without terminal speeds and flutter."""
     zeros = np.zeros(len(ids), np.float32)
     known = {
         "ids": ids,

@@ -1,7 +1,7 @@
-"""What happened to every particle of a run of the paper's solver, collected frame by frame into one history.
+"""Record of a run of the paper's solver, collected frame by frame into one history.
 
-A particle that the threshold took out of the motion has collided as far as the paper is concerned, wherever it is: near the
-mesh it is laid onto the closest point, elsewhere it hangs where it stopped.
+In the paper, a particle below the movement threshold has collided, wherever it is. Near the mesh it is projected onto the
+closest point; elsewhere it hangs where it stopped.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from pgsd_nerfstudio.physics.bodies import LANDED, LEFT, Bodies, RunState
+from pgsd_nerfstudio.physics.bodies import LANDED, LEFT, Bodies, RunState, random_orientations
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.ground.landing import SMALLEST, Ground, RestPose
 from pgsd_nerfstudio.physics.record.chunks import Chunk, assemble
@@ -32,7 +32,13 @@ class RunRecord:
     """Rows, births and ends so far; positions in metres."""
 
     def __init__(self, ground: Ground, near: float, diameter: float) -> None:
-        """`near`: metres from the mesh within which what stopped is laid onto it."""
+        """Start an empty record.
+
+        Args:
+            ground: the surface for contacts.
+            near: metres from the mesh within which a stopped particle is projected onto it.
+            diameter: of every particle, m.
+        """
         self.ground, self.near, self.diameter = ground, near, diameter
         self.born, self.hanging = 0, 0
         self._births: list[tuple[int, int]] = []
@@ -41,35 +47,48 @@ class RunRecord:
         self._rests: list[tuple[ndarray, RestPose]] = []
 
     def birth(self, frame: int, count: int) -> Int[ndarray, " n"]:
-        """Ids of particles that come in at `frame`."""
+        """Record new particles at `frame`; returns their ids."""
         self._births.append((frame, count))
         self.born += count
         return np.arange(self.born - count, self.born, dtype=np.int32)
 
     def at(self, frame: int, ids: Int[ndarray, " n"], positions: Float[ndarray, "n 3"]) -> None:
-        """Active particles of a frame, including those that stop in it."""
+        """Record positions (m) of active particles in a frame, including those that stop in it."""
         self._rows.append((ids, frame, positions.astype(np.float32)))
 
     def left(self, frame: int, ids: Int[ndarray, " n"]) -> None:
-        """They are outside of the domain at `frame`."""
+        """Record particles that are outside of the domain at `frame`."""
         self._stops.append(_Stop(ids, frame, LEFT))
 
     def stopped(
         self, frame: int, ids: Int[ndarray, " n"], positions: Float[ndarray, "n 3"], spins: Float[ndarray, " n"]
     ) -> None:
-        """They hit the mesh or came to rest at `frame`, their last active one."""
+        """Record particles that made contact or came to rest.
+
+        Args:
+            frame: their last active frame.
+            ids: the particles.
+            positions: m.
+            spins: turns about the surface normal.
+        """
         self._stops.append(_Stop(ids, frame + 1, LANDED))
         close = self._close(positions)
         self.hanging += int((~close).sum())
-        lying = self.ground.rest(positions[close], spins[close])
+        landed = self.ground.rest(positions[close], spins[close])
         upright = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (int((~close).sum()), 1))
         extent = np.full(len(upright), SMALLEST * self.ground.response.probe, np.float32)
-        self._rests.append((ids[close], lying))
+        self._rests.append((ids[close], landed))
         self._rests.append((ids[~close], RestPose(positions[~close].astype(np.float32), upright, extent)))
 
     def history(self, clock: Clock, bodies: Bodies, seed: int, about: Mapping[str, Any]) -> ParticleHistory:
-        """All of it; `bodies` are those still in the air."""
-        quats = np.random.default_rng([seed, 0x0417]).normal(size=(self.born, 4))
+        """The history of the run.
+
+        Args:
+            clock: shown frame rate and number of frames.
+            bodies: particles that are active at the end.
+            seed: of the orientations.
+            about: plain values to keep with the history.
+        """
         nothing, no_rest = np.zeros(0, np.int32), self.ground.rest(np.zeros((0, 3)), np.zeros(0))
         rests = [(nothing, no_rest), *self._rests]
         chunk = Chunk(
@@ -81,7 +100,7 @@ class RunRecord:
             births=np.concatenate([np.full(count, frame, np.int32) for frame, count in self._births]),
             diameters=np.full(self.born, self.diameter, np.float32),
             represents=np.ones(self.born, np.float32),
-            quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+            quats=random_orientations([seed, 0x0417], self.born),
             kind_ids=nothing,
             kind_bits=np.zeros(0, np.uint8),
             ended_ids=np.concatenate([nothing, *(stop.ids for stop in self._stops)]),
@@ -97,5 +116,5 @@ class RunRecord:
         return assemble([chunk], clock, {**about, "hanging": self.hanging})
 
     def _close(self, positions: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Within `near` of the mesh."""
+        """Which positions are within `near` of the mesh."""
         return self.ground.surface.closest(torch.from_numpy(positions.astype(np.float32))).distance.numpy() <= self.near

@@ -1,8 +1,8 @@
 """The paper's solver: dynamic particles of one material among stationary ones, in a unit cube.
 
-A frame takes 13 substeps of the published length. Where the original divides by zero or reads outside of its grid (stiff
-matter, long steps, hardened snow), substeps are shortened until sound and the fastest particle stay within `courant` cells; a
-frame that would need more than `max_substeps` is refused before it blows up.
+A frame takes 13 substeps of the published length. The original divides by zero or reads outside of its grid with stiff matter,
+long steps or hardened snow. Here substeps are shortened until sound and the fastest particle together travel at most `courant`
+cells, and a frame that would need more than `max_substeps` is refused before it blows up.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ _QUANTITIES = {
 
 @dataclass(frozen=True)
 class Box:
-    """Where the unit cube lies in metres: turned nowhere, scaled the same on all axes.
+    """Place of the unit cube in metres. It is not rotated and has the same scale on all axes.
 
-    The longest edge of the domain spans 0.05 .. 0.95 of the cube; the domain stands on height 0.05 and is centred on the two
-    horizontal axes. The paper stretches the vertical axis until it fills the cube as well; here shapes stay what they are.
+    The longest edge of the domain spans 0.05 .. 0.95 of the cube. The domain's floor is at height 0.05, and the domain is
+    centred on the two horizontal axes. The paper stretches the vertical axis until it fills the cube; here shapes are kept.
     """
 
     corner: Float[ndarray, "3"]
-    """Of the cube, in metres."""
+    """Lower corner of the cube, in metres."""
     metres: float
-    """Edge of the cube."""
+    """Edge of the cube, in metres."""
     bounds: Float[ndarray, "2 3"]
-    """Lower and upper corner of the domain, in boxes: what is outside of them is outside of the simulation."""
+    """Lower and upper corner of the domain, in boxes; particles outside have left the simulation."""
 
     @staticmethod
     def of(domain: Domain) -> Box:
@@ -72,17 +72,19 @@ class PaperSolver:
     """Particles in the cube, in the order of their birth; `keep` drops those that have ended."""
 
     def __init__(self, config: PaperConfig, box: Box, stationary: Float[ndarray, "s 3"]) -> None:
-        """Lay out the grid.
+        """Allocate the grid and the stationary particles.
 
         Args:
-            stationary: boxes. Those beyond the outermost cells can never touch anything and are left out.
+            config: the numbers of the effect.
+            box: place of the unit cube.
+            stationary: positions of the stationary particles in boxes; those outside of the grid are left out.
 
         Raises:
             ValueError: a stationary position is not finite, or the device is not there.
         """
         self.config, self.box = config, box
         self.frame = 0
-        """That is being simulated, or was last."""
+        """Frame that is being simulated or was simulated last."""
         self.substeps = 0
         self._start = start(config.device, config.precision, config.threads)
         self._real = {"dtype": dtype_of(config.precision), "device": config.device}
@@ -106,17 +108,17 @@ class PaperSolver:
 
     @property
     def positions(self) -> Float[ndarray, "n 3"]:
-        """Boxes; a copy. Of a particle that left: the first position outside."""
+        """Positions in boxes, a copy. A particle that left has its first position outside."""
         return self.state[:, X : X + 3].numpy(force=True).astype(np.float64)
 
     @property
     def velocities(self) -> Float[ndarray, "n 3"]:
-        """boxes/s; a copy."""
+        """Velocities in boxes/s, a copy."""
         return self.state[:, V : V + 3].numpy(force=True).astype(np.float64)
 
     @property
     def inside(self) -> Bool[ndarray, " n"]:
-        """Which have not left the domain."""
+        """Which particles have not left the domain."""
         return self._inside.numpy(force=True) > 0
 
     @property
@@ -125,7 +127,15 @@ class PaperSolver:
         return self._grid.clone()
 
     def emit(self, positions: Float[ndarray, "n 3"], velocities: Float[ndarray, "n 3"]) -> None:
-        """Add particles at rest in themselves, with positions in boxes and velocities in boxes/s."""
+        """Add particles without deformation and velocity gradient.
+
+        Args:
+            positions: boxes.
+            velocities: boxes/s.
+
+        Raises:
+            RuntimeError: another solver has started Taichi anew since.
+        """
         self._require_alive()
         new = self._at_rest(torch.as_tensor(positions))
         new[:, V : V + 3] = torch.as_tensor(velocities).to(**self._real)
@@ -136,16 +146,20 @@ class PaperSolver:
         self._signal = torch.cat([self._signal, new[:, V : V + 3].norm(dim=1) + self.config.sound_speed])
 
     def keep(self, which: Bool[ndarray, " n"]) -> None:
-        """Go on with these particles only."""
+        """Keep only the chosen particles."""
         chosen = torch.as_tensor(which, device=self.config.device)
         self.state, self._inside, self._signal = self.state[chosen], self._inside[chosen], self._signal[chosen]
 
     def step(self) -> int:
-        """Advance by one frame; returns how many substeps it took, 0 where there are no particles.
+        """Advance by one frame.
+
+        Returns:
+            The number of substeps; 0 where there are no particles.
 
         Raises:
-            ValueError: more than `max_substeps` would be needed, then the message names the cause; or a quantity became NaN or
-                infinite, then it names the quantity and the frame.
+            ValueError: more than `max_substeps` would be needed, and the message names the cause; or a quantity became NaN or
+                infinite, and the message names the quantity and the frame.
+            RuntimeError: another solver has started Taichi anew since.
         """
         self._require_alive()
         self.frame += 1
@@ -164,7 +178,7 @@ class PaperSolver:
         return done
 
     def substep(self, dt: float) -> None:
-        """Advance by `dt` seconds, whether that is stable or not."""
+        """Advance by `dt` seconds without a check of stability."""
         config, count = self.config, len(self)
         mu, lam = config.moduli
         kind, mass = _KINDS[config.material], DENSITY * config.particle_volume
@@ -182,7 +196,7 @@ class PaperSolver:
         kernels.gather(*where, count, dt, config.cells, kind, lam + 2 * mu, DENSITY)
 
     def _at_rest(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 25"]:
-        """Rows of particles that neither move nor are deformed."""
+        """State rows of particles without velocity and deformation."""
         rows = torch.zeros(len(positions), WIDTH, **self._real)
         rows[:, X : X + 3] = positions.to(**self._real)
         rows[:, [F, F + 4, F + 8]] = 1.0

@@ -1,1 +1,1 @@
-"""What is kept of a simulation: chunks while it runs, then the history of every particle."""
+"""Records of a simulation: its chunks while it runs, then the history of every particle."""

@@ -1,4 +1,4 @@
-"""A run in pieces: what a chunk of frames yields, how it is stored, how chunks become one history."""
+"""Chunks of a run: the record of some frames, its file, and the history that all chunks make together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState
+from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.record.codec import quantised
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -21,7 +21,7 @@ from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
 
 @dataclass(frozen=True)
 class Chunk:
-    """What happened in `frames` frames from `start` on."""
+    """Record of `frames` frames from `start` on."""
 
     start: int
     frames: int
@@ -29,29 +29,36 @@ class Chunk:
     """Particle of each row; rows are ordered by frame."""
     row_frames: Int[ndarray, " m"]
     row_positions: Float[ndarray, "m 3"]
+    """Metres."""
     births: Int[ndarray, " b"]
-    """Of the particles born in this chunk, whose ids follow on from the chunk before."""
+    """First active frame of each particle born in this chunk; their ids follow those of the chunk before."""
     diameters: Float[ndarray, " b"]
+    """Metres."""
     represents: Float[ndarray, " b"]
+    """Real particles that each particle represents."""
     quats: Float[ndarray, "b 4"]
+    """Orientation while active, wxyz."""
     kind_ids: Int[ndarray, " k"]
-    """Particles that became of a kind in this chunk, and the bits of all kinds that they then have been of."""
+    """Particles whose kinds changed in this chunk."""
     kind_bits: Int[ndarray, " k"]
+    """Bits of all kinds of each of them."""
     ended_ids: Int[ndarray, " e"]
     ended_frames: Int[ndarray, " e"]
     """Exclusive end of the active frames."""
     ended_how: Int[ndarray, " e"]
+    """LANDED, ABSORBED, LEFT or UNSEEN."""
     rest_ids: Int[ndarray, " h"]
-    """Of those that landed."""
+    """Particles that landed; the other rest arrays are as in `ParticleHistory`."""
     rest_positions: Float[ndarray, "h 3"]
     rest_quats: Float[ndarray, "h 4"]
     rest_extents: Float[ndarray, " h"]
     rest_covers: Float[ndarray, " h"]
     state: RunState
-    """At the end of the chunk."""
+    """State at the end of the chunk."""
 
 
 _ARRAYS = tuple(f.name for f in fields(Chunk) if f.name not in ("start", "frames", "state"))
+_STATE = "state."  # before the names of the state's arrays in a file
 
 
 def _path(folder: Path, index: int) -> Path:
@@ -59,10 +66,18 @@ def _path(folder: Path, index: int) -> Path:
 
 
 def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
-    """Store a chunk; False where the disk would not take it."""
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(getattr(chunk, name))) for name in _ARRAYS}
-    arrays = chunk.state.arrays()
-    tensors |= {f"state.{name}": torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+    """Store a chunk.
+
+    Args:
+        folder: folder of the run's chunks.
+        index: number of the chunk.
+        chunk: the record.
+
+    Returns:
+        False where the file could not be written.
+    """
+    arrays = {name: getattr(chunk, name) for name in _ARRAYS} | with_prefix(_STATE, chunk.state.arrays())
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
     plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born, "carry": chunk.state.carry.hex()}
     try:
         save_tensors(_path(folder, index), tensors, {**plain, "content": content_key(tensors, plain)})
@@ -72,7 +87,14 @@ def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
 
 
 def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | None:
-    """A stored chunk; None where there is none, or where what is there is damaged or of other frames."""
+    """A stored chunk; None where there is no file, or where it is damaged or has other frames.
+
+    Args:
+        folder: folder of the run's chunks.
+        index: number of the chunk.
+        start: its first frame.
+        frames: its number of frames.
+    """
     stored = load_tensors(_path(folder, index))
     if stored is None:
         return None
@@ -81,17 +103,22 @@ def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | Non
     if content != content_key(tensors, about) or (about.get("start"), about.get("frames")) != (start, frames):
         return None
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    inner = {name: arrays.pop(name) for name in list(arrays) if name.startswith("state.")}
-    inner = {name.removeprefix("state."): value for name, value in inner.items()}
-    state = RunState.of(inner, about["born"], float.fromhex(about["carry"]))
-    return Chunk(start=start, frames=frames, state=state, **arrays)
+    state = RunState.of(without_prefix(_STATE, arrays), about["born"], float.fromhex(about["carry"]))
+    own = {name: value for name, value in arrays.items() if not name.startswith(_STATE)}
+    return Chunk(start=start, frames=frames, state=state, **own)
 
 
-_LYING = {"positions": (3,), "quats": (4,), "extents": (), "covers": ()}
+_REST = {"positions": (3,), "quats": (4,), "extents": (), "covers": ()}
 
 
 def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) -> ParticleHistory:
-    """One history from all chunks of a run; `about` gains the counts of how particles ended."""
+    """The history of a run.
+
+    Args:
+        chunks: all chunks of the run, in order.
+        clock: frame rate and number of frames.
+        about: plain values to keep with the history, which also gets the counts of particles by kind and by how they ended.
+    """
 
     def joined(name: str) -> ndarray:
         return np.concatenate([getattr(chunk, name) for chunk in chunks])
@@ -106,9 +133,9 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     positions[offsets[ids] + joined("row_frames") - births[ids]] = joined("row_positions")
     rests, collided = joined("rest_ids"), np.zeros(count, bool)
     collided[rests] = True
-    lying = {f"rest_{name}": np.zeros((count, *shape), np.float32) for name, shape in _LYING.items()}
-    lying["rest_quats"][:, 0] = 1.0
-    for name, value in lying.items():
+    rest = {f"rest_{name}": np.zeros((count, *shape), np.float32) for name, shape in _REST.items()}
+    rest["rest_quats"][:, 0] = 1.0
+    for name, value in rest.items():
         value[rests] = joined(name)
     kinds = np.zeros(count, np.uint8)
     np.bitwise_or.at(kinds, joined("kind_ids"), joined("kind_bits"))
@@ -118,7 +145,7 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         "collided": collided,
         "offsets": offsets,
         "positions": quantised(positions, offsets),
-        **lying,
+        **rest,
         "quats": joined("quats"),
         "diameters": joined("diameters"),
         "represents": joined("represents"),

@@ -1,14 +1,14 @@
-"""Trajectories in few bytes: one per coordinate where a particle moves smoothly, three or seven where it does not.
+"""Compression of trajectories: one byte per coordinate where a particle moves smoothly, three or seven where it does not.
 
-Positions are rounded to a lattice once, and the lattice points, whole numbers, are then kept exactly. Each is predicted from
-the two before it on the same trajectory, 2 x(t-1) - x(t-2), and what remains, the second difference, goes into one byte; the
-first point is predicted as zero, the second as the first. What a byte cannot hold leaves a mark there and goes into a list of
-two-byte numbers, and what those cannot hold leaves a mark there too and goes into a list of four-byte numbers. Since the
-prediction is made from what the reader has as well, nothing accumulates.
+Positions are rounded once to a lattice, and the lattice points, whole numbers, are stored exactly. Each point is predicted from
+the two before it on the same trajectory, 2 x(t-1) - x(t-2), and the remainder, the second difference, is stored in one byte.
+The first point is predicted as zero, the second as the first. A difference too large for one byte leaves a mark there and goes
+into a list of two-byte numbers; a difference too large for that leaves a mark there too and goes into a list of four-byte
+numbers. The prediction uses only numbers that the decoder has as well, so errors do not accumulate.
 
-The quantum is 2^-14 m (0.06 mm) as long as all coordinates are within 2^10 m of the origin, and beyond that the finest power of
-two with which they still are at most 2^24 quanta. So float32 holds each lattice point exactly, and second differences, at most
-2^26, never leave four bytes.
+The quantum is 2^-14 m (0.06 mm) as long as all coordinates are within 2^10 m of the origin. Beyond that it is the finest power
+of two with which coordinates are at most 2^24 quanta. So float32 holds each lattice point exactly, and second differences, at
+most 2^26, always fit into four bytes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from numpy import ndarray
 
 FINEST = -14  # binary exponent of the smallest quantum in metres
 MOST = 2**24  # quanta up to which float32 holds every whole number
-_ONE, _TWO = -(2**7), -(2**15)  # marks: the number is in the next wider list
+_ONE, _TWO = -(2**7), -(2**15)  # marks of a number that is in the next wider list
 
 
 class Steps(NamedTuple):
     """Second differences of m positions in quanta, ordered by particle, axis and frame; see the module."""
 
     one: Int[ndarray, " m*3"]
-    """int8; -128 stands for the next one of `two`."""
+    """int8; -128 marks the next number of `two`."""
     two: Int[ndarray, " e"]
-    """int16; -32768 stands for the next one of `four`."""
+    """int16; -32768 marks the next number of `four`."""
     four: Int[ndarray, " f"]
     """int32."""
     exponent: int
@@ -40,7 +40,11 @@ class Steps(NamedTuple):
 
 
 def encode(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -> Steps:
-    """Steps of trajectories; particle i has the rows offsets[i] .. offsets[i+1] of float32 `positions` in metres.
+    """Encode trajectories.
+
+    Args:
+        positions: float32, m.
+        offsets: particle i has the rows offsets[i] .. offsets[i+1].
 
     Raises:
         ValueError: a position is NaN or infinite, or the offsets do not ascend from 0 to m.
@@ -50,7 +54,11 @@ def encode(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -> S
 
 
 def decode(steps: Steps, offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
-    """float32 positions in metres.
+    """Decode trajectories into float32 positions in metres.
+
+    Args:
+        steps: what `encode` returned.
+        offsets: particle i has the rows offsets[i] .. offsets[i+1].
 
     Raises:
         ValueError: the steps are not those of trajectories with these offsets.
@@ -69,7 +77,11 @@ def decode(steps: Steps, offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]
 
 
 def quantised(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
-    """What decoding the encoded positions gives; positions that came from here stay as they are, bit for bit.
+    """Positions rounded to the lattice, as `decode` returns them; rounded positions stay the same bit for bit.
+
+    Args:
+        positions: float32, m.
+        offsets: particle i has the rows offsets[i] .. offsets[i+1].
 
     Raises:
         ValueError: as in `encode`.
@@ -81,7 +93,7 @@ def quantised(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -
 
 
 def _exponent(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -> int:
-    """Of the quantum for these positions."""
+    """Binary exponent of the quantum for these positions."""
     if positions.dtype != np.float32:
         raise ValueError(f"positions must be float32, found {positions.dtype}")
     _check_offsets(offsets, len(positions))
@@ -94,8 +106,8 @@ def _exponent(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -
         )
     if largest <= math.ldexp(MOST, FINEST):
         return FINEST
-    # The smallest with which `largest` is at most MOST quanta. Float32 is no finer there, so `largest` lies on the lattice
-    # already: rounded positions have the same largest coordinate and so the same quantum.
+    # The smallest exponent with which `largest` is at most MOST quanta. Float32 is no finer there, so `largest` is a lattice
+    # point already: rounded positions have the same largest coordinate and therefore the same quantum.
     mantissa, exponent = math.frexp(largest / MOST)
     return exponent - 1 if mantissa == 0.5 else exponent
 
@@ -123,7 +135,7 @@ def _survey(positions):
 def _round(positions, quanta, quantum, rounded):
     for row in range(len(positions)):
         for axis in range(3):
-            # By way of a whole number, as when decoding, so that there is no negative zero.
+            # The way through a whole number, as in decoding, avoids a negative zero.
             rounded[row, axis] = np.int64(np.rint(positions[row, axis] * quanta)) * quantum
 
 
@@ -139,7 +151,7 @@ def _encode(positions, offsets, quanta):
             for row in range(first, stop):
                 here = np.int64(np.rint(positions[row, axis] * quanta))
                 step = here - 2 * last + before
-                before = here if row == first else last  # as if it had been at rest
+                before = here if row == first else last  # the first point is taken as if the particle had been at rest
                 last = here
                 if abs(step) < 2**7:
                     one[n] = step
@@ -161,7 +173,7 @@ def _encode(positions, offsets, quanta):
 
 @numba.njit(cache=True, nogil=True)
 def _decode(one, two, four, offsets, quantum, positions):
-    """The lists must have as many numbers as there are marks."""
+    """Decode; the lists must have as many numbers as there are marks."""
     n = twos = fours = 0
     for particle in range(len(offsets) - 1):
         first, stop = offsets[particle], offsets[particle + 1]

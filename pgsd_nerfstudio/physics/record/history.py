@@ -1,8 +1,8 @@
-"""Trajectories of all particles of one simulation, stored ragged: each particle only from its birth to its end.
+"""Trajectories of all particles of one simulation, stored ragged: each particle has rows only from its birth to its end.
 
-Frames count rendered time steps. A particle is *active* in the frames births <= frame < ends. One that hits a surface is active
-through the frame of the hit, its last active position being the contact, and *collided* from `ends` to the last frame, where it
-lies at `rest_positions`. One that leaves the domain simply ends.
+Frames count rendered time steps. A particle is *active* in the frames births <= frame < ends. A particle that lands is active
+through the frame of the contact, which is its last active position; from `ends` to the last frame it is *collided* and rests at
+`rest_positions`. A particle that leaves the domain or is absorbed ends without a rest position.
 """
 
 from __future__ import annotations
@@ -21,49 +21,50 @@ from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 
 class Window(NamedTuple):
-    """Trajectories of one clip as dense tensors."""
+    """Trajectories in t consecutive frames as dense tensors."""
 
     ids: Int[Tensor, " n"]
     """Particles that are active in at least one frame of the window."""
     positions: Float[Tensor, "n t 3"]
-    """Metres; before birth the first, after the end the last active position."""
+    """Metres; the first active position before birth, the last one after the end."""
     active: Bool[Tensor, "n t"]
 
 
 @dataclass(frozen=True)
 class ParticleHistory:
-    """P particles over `frames` frames; all tensors share a device."""
+    """Trajectories of p particles over `frames` frames. All tensors share a device."""
 
     births: Int[Tensor, " p"]
     """First active frame, int32. A particle that is in the air from the start has 0."""
     ends: Int[Tensor, " p"]
     """Exclusive end of the active frames, int32."""
     collided: Bool[Tensor, " p"]
-    """Rests on a surface from `ends` on."""
+    """Whether the particle is at rest on a surface from `ends` on."""
     offsets: Int[Tensor, " p+1"]
     """Row of `positions` where each particle's active frames start, int64."""
     positions: Float[Tensor, "m 3"]
     """Metres, metric frame; rows offsets[i] .. offsets[i+1] belong to frames births[i] .. ends[i]."""
     rest_positions: Float[Tensor, "p 3"]
-    """Where it rests, metres; zero where it did not collide."""
+    """Positions at rest, metres; zero for particles that did not collide."""
     rest_quats: Float[Tensor, "p 4"]
-    """Orientation at rest, wxyz: the local z axis is the surface normal, spin about it is random."""
+    """Orientation at rest, wxyz: the local z axis is the surface normal, the spin about it is random."""
     rest_extents: Float[Tensor, " p"]
     """Radius in metres over which the surface around the contact is flat and unbroken."""
     rest_covers: Float[Tensor, " p"]
-    """Thickness along z in metres of the cover on which it lies; zero where there is none."""
+    """Thickness along z in metres of the cover beneath the particle; zero where there is none."""
     quats: Float[Tensor, "p 4"]
-    """Orientation in flight, wxyz."""
+    """Orientation while active, wxyz."""
     diameters: Float[Tensor, " p"]
     """Metres."""
     represents: Float[Tensor, " p"]
-    """How many real particles each one stands for."""
+    """Real particles that each particle represents."""
     kinds: Int[Tensor, " p"]
-    """What it ever was, uint8 bits: 1 droplet of a splash, 2 slid, 4 dense matter."""
+    """uint8 bits: 1 the particle is a splash droplet, 2 it has slid, 4 it has been dense matter."""
     fps: float
+    """Frames per second."""
     frames: int
     about: Mapping[str, Any] = field(default_factory=dict)
-    """What it was made from and what happened: plain values, saved as JSON."""
+    """Settings and totals of the simulation: plain values, saved as JSON."""
 
     def __post_init__(self) -> None:
         p = self.births.shape[0]
@@ -86,22 +87,22 @@ class ParticleHistory:
         return sum(getattr(self, name).nbytes for name in _TENSORS)
 
     def active(self, frame: int) -> Int[Tensor, " n"]:
-        """Ids of the particles in the air at `frame`, ascending."""
+        """Ids of the particles that are active at `frame`, ascending."""
         return ((self.births <= frame) & (frame < self.ends)).nonzero()[:, 0]
 
     def resting(self, frame: int) -> Int[Tensor, " n"]:
-        """Ids of the particles that have landed before or at `frame` and lie still, ascending."""
+        """Ids of the particles that have collided and are at rest at `frame`, ascending."""
         return (self.collided & (self.ends <= frame)).nonzero()[:, 0]
 
     def positions_at(self, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Positions in metres of active particles; `ids` must be active at `frame`."""
+        """Positions in metres of particles that are active at `frame`."""
         return self.positions[self._rows(frame, ids)]
 
     def displacement_at(self, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Velocity per frame, x(frame) - x(frame - 1), in metres, of active particles.
+        """Displacements x(frame) - x(frame - 1) in metres of particles that are active at `frame`.
 
-        In the frame of birth there is no position before: there it is the first step, x(birth + 1) - x(birth), as if the
-        particle had come in with the velocity it goes on with; zero for a particle that is active in one frame only.
+        In the frame of birth the displacement is that of the next frame, x(birth + 1) - x(birth), as if the particle had
+        entered with that velocity. It is zero for a particle that is active in one frame only.
         """
         rows = self._rows(frame, ids)
         born = self.births[ids] == frame
@@ -110,7 +111,7 @@ class ParticleHistory:
         return self.positions[here] - self.positions[torch.where(born, rows, rows - 1)]
 
     def window(self, start: int, stop: int) -> Window:
-        """Dense trajectories of the particles active at some time in frames start .. stop (exclusive)."""
+        """Dense trajectories of the particles that are active in any of the frames start .. stop (exclusive)."""
         ids = ((self.births < stop) & (start < self.ends)).nonzero()[:, 0]
         at = torch.arange(start, stop, device=self.device)
         born, ended = self.births[ids].long()[:, None], self.ends[ids].long()[:, None]
@@ -118,7 +119,7 @@ class ParticleHistory:
         return Window(ids, self.positions[rows], (born <= at) & (at < ended))
 
     def select(self, ids: Int[Tensor, " n"]) -> ParticleHistory:
-        """The history of these particles alone, in this order; their ids there are 0 .. n - 1."""
+        """The history of the given particles alone, in their order; their new ids are 0 .. n - 1."""
         first, lengths = self.offsets[ids], self.offsets[ids + 1] - self.offsets[ids]
         offsets = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
         total = int(offsets[-1])
@@ -127,10 +128,15 @@ class ParticleHistory:
         return replace(self, **every, offsets=offsets, positions=self.positions[rows])
 
     def to(self, device: torch.device | str) -> ParticleHistory:
+        """The same history on another device."""
         return replace(self, **{name: getattr(self, name).to(device) for name in _TENSORS})
 
     def check_finite(self) -> None:
-        """Raises ValueError that names the first quantity that is NaN or infinite, with the particle and frame."""
+        """Check that all numbers are finite.
+
+        Raises:
+            ValueError: a quantity is NaN or infinite; the message names the first one, with its particle and frame.
+        """
         for name in _TENSORS:
             value = getattr(self, name)
             if value.dtype.is_floating_point and not bool(torch.isfinite(value).all()):
@@ -157,7 +163,7 @@ class ParticleHistory:
 
     @staticmethod
     def load(path: Path) -> ParticleHistory | None:
-        """A saved history; None where there is none, or where the file is damaged or of another format."""
+        """A saved history; None where there is no file, or where it is damaged or has another format."""
         stored = load_tensors(path)
         if stored is None or stored[1].get("format") != _FORMAT or _STORED - set(stored[0]):
             return None
@@ -178,5 +184,5 @@ class ParticleHistory:
 
 _FORMAT = 2
 _TENSORS = tuple(f.name for f in fields(ParticleHistory) if f.name not in ("fps", "frames", "about"))
-_LISTS = ("steps", "steps_two", "steps_four")  # in a file these stand for the positions
+_LISTS = ("steps", "steps_two", "steps_four")  # names of the encoded positions in a file
 _STORED = (set(_TENSORS) - {"positions"}) | set(_LISTS)

@@ -1,4 +1,4 @@
-"""What happens in a chunk, noted frame by frame."""
+"""Log of a chunk: it collects the rows, births and ends of particles frame by frame."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
-from pgsd_nerfstudio.physics.bodies import LANDED, Bodies, RunState
+from pgsd_nerfstudio.physics.bodies import LANDED, Bodies, RunState, random_orientations
 from pgsd_nerfstudio.physics.ground.landing import Ground
 from pgsd_nerfstudio.physics.record.chunks import Chunk
 
 
 class Log:
-    """Rows, births and ends of the frames of one chunk."""
+    """Rows, births and ends in the frames of one chunk."""
 
     def __init__(self, start: int, frames: int, born: int) -> None:
         self.start, self.frames = start, frames
@@ -21,10 +21,10 @@ class Log:
         self._births: list[tuple[int, Bodies]] = []
         self._ends: list[tuple[ndarray, int, int]] = []
         self._kinds: list[Bodies] = []
-        self._lying: list[tuple[Bodies, ndarray]] = []
+        self._landed: list[tuple[Bodies, ndarray]] = []
 
     def enter(self, bodies: Bodies, frame: int) -> Bodies:
-        """New particles; hands them back with their ids."""
+        """Record new particles; returns them with their ids."""
         ids = np.arange(self.born, self.born + len(bodies), dtype=np.int32)
         self.born += len(bodies)
         new = Bodies(ids, *(value for name, value in vars(bodies).items() if name != "ids"))
@@ -35,29 +35,46 @@ class Log:
         return new
 
     def see(self, bodies: Bodies, frame: int) -> None:
-        """Where particles are in a frame."""
+        """Record the positions of particles in a frame."""
         self._rows.append((bodies.ids, frame, bodies.positions.copy()))
 
     def become(self, bodies: Bodies) -> None:
-        """Particles whose kinds have changed."""
+        """Record particles whose kinds have changed."""
         self._kinds.append(bodies)
 
     def end(self, bodies: Bodies, frame: int, how: int) -> None:
-        """Particles that are not active from `frame` on."""
+        """Record particles that are not active from `frame` on.
+
+        Args:
+            bodies: the particles.
+            frame: exclusive end of their active frames.
+            how: LANDED, ABSORBED, LEFT or UNSEEN.
+        """
         self._ends.append((bodies.ids, frame, how))
 
     def land(self, bodies: Bodies, covers: ndarray, frame: int) -> None:
-        """Particles whose last active frame is `frame`, and the thickness of the cover on which they lie."""
+        """Record particles that land.
+
+        Args:
+            bodies: the particles at their contacts.
+            covers: [n] thickness of the cover beneath each, m.
+            frame: their last active frame.
+        """
         self.end(bodies, frame + 1, LANDED)
-        self._lying.append((bodies, covers.astype(np.float32)))
+        self._landed.append((bodies, covers.astype(np.float32)))
 
     def chunk(self, ground: Ground, seed: int, state: RunState) -> Chunk:
-        """All of it as arrays; lays down what has landed."""
+        """The record of the chunk.
+
+        Args:
+            ground: gives landed particles their poses.
+            seed: of the orientations of new particles.
+            state: at the end of the chunk.
+        """
         new = Bodies.join([Bodies.none(), *(entering for _, entering in self._births)])
-        lying = Bodies.join([Bodies.none(), *(bodies for bodies, _ in self._lying)])
-        covers = np.concatenate([np.zeros(0, np.float32), *(covers for _, covers in self._lying)])
-        rest = ground.rest(lying.positions, lying.spins, covers)
-        quats = np.random.default_rng([seed, self.start, 0x0417]).normal(size=(self.born - self.first, 4))
+        landed = Bodies.join([Bodies.none(), *(bodies for bodies, _ in self._landed)])
+        covers = np.concatenate([np.zeros(0, np.float32), *(covers for _, covers in self._landed)])
+        rest = ground.rest(landed.positions, landed.spins, covers)
         changed = Bodies.join([Bodies.none(), *self._kinds])
         row_ids = _joined([ids for ids, _, _ in self._rows], np.int32)
         row_frames = _joined([np.full(len(ids), frame, np.int32) for ids, frame, _ in self._rows], np.int32)
@@ -70,13 +87,13 @@ class Log:
             births=_joined([np.full(len(entering), frame, np.int32) for frame, entering in self._births], np.int32),
             diameters=new.diameters,
             represents=new.represents,
-            quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+            quats=random_orientations([seed, self.start, 0x0417], self.born - self.first),
             kind_ids=changed.ids,
             kind_bits=changed.kinds,
             ended_ids=_joined([ids for ids, _, _ in self._ends], np.int32),
             ended_frames=_joined([np.full(len(ids), end, np.int32) for ids, end, _ in self._ends], np.int32),
             ended_how=_joined([np.full(len(ids), how, np.uint8) for ids, _, how in self._ends], np.uint8),
-            rest_ids=lying.ids,
+            rest_ids=landed.ids,
             rest_positions=rest.positions,
             rest_quats=rest.quats,
             rest_extents=rest.extents,

@@ -1,4 +1,4 @@
-"""What a simulated weather holds, frame by frame: how many particles in which state, their mass, momentum and energy."""
+"""Report on a simulation, frame by frame: particles by state, their mass, momentum and energy."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 
 def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
-    """Plain values for JSON. Mass, momentum and energy are those of the real particles that the simulated ones stand for.
+    """Plain values for JSON. Mass, momentum and energy are those of the represented real particles.
 
-    Lists have one number for each frame: particles `in_air` (all on their way) and `resting`; `mass_in_air` and
-    `mass_resting` in kg; `momentum`
-    [3] in kg m/s and `kinetic_energy` in J of what is in the air; `potential_energy` in J of all, above height 0.
+    Args:
+        history: the trajectories.
+        material: gives the mass of a particle of each diameter.
+
+    Returns:
+        Totals, and under `per_frame` lists with one entry per frame: numbers of active particles (`in_air`) and of particles at
+        rest (`resting`); `mass_in_air` and `mass_resting` in kg; `momentum` [3] in kg m/s and `kinetic_energy` in J of the
+        active particles; `potential_energy` in J of all particles, relative to height 0.
     """
     masses = material.mass(history.diameters.double().cpu()) * history.represents.double().cpu()
     rows: dict[str, list[Any]] = {
@@ -24,20 +29,22 @@ def report(history: ParticleHistory, material: Material) -> dict[str, Any]:
         for name in ("in_air", "resting", "mass_in_air", "mass_resting", "momentum", "kinetic_energy", "potential_energy")
     }
     for frame in range(history.frames):
-        flying, lying = history.active(frame), history.resting(frame)
-        velocity = history.displacement_at(frame, flying).double().cpu() * history.fps
-        heavy, heights = masses[flying.cpu()], history.positions_at(frame, flying)[:, 2].double().cpu()
-        resting_heights = history.rest_positions[lying][:, 2].double().cpu()
-        rows["in_air"].append(len(flying))
-        rows["resting"].append(len(lying))
-        rows["mass_in_air"].append(float(heavy.sum()))
-        rows["mass_resting"].append(float(masses[lying.cpu()].sum()))
-        rows["momentum"].append((heavy[:, None] * velocity).sum(0).tolist())
-        rows["kinetic_energy"].append(float((0.5 * heavy * velocity.square().sum(1)).sum()))
-        potential = (heavy * heights).sum() + (masses[lying.cpu()] * resting_heights).sum()
+        active, resting = history.active(frame), history.resting(frame)
+        velocity = history.displacement_at(frame, active).double().cpu() * history.fps
+        active_masses, resting_masses = masses[active.cpu()], masses[resting.cpu()]
+        heights = history.positions_at(frame, active)[:, 2].double().cpu()
+        resting_heights = history.rest_positions[resting][:, 2].double().cpu()
+        rows["in_air"].append(len(active))
+        rows["resting"].append(len(resting))
+        rows["mass_in_air"].append(float(active_masses.sum()))
+        rows["mass_resting"].append(float(resting_masses.sum()))
+        rows["momentum"].append((active_masses[:, None] * velocity).sum(0).tolist())
+        rows["kinetic_energy"].append(float((0.5 * active_masses * velocity.square().sum(1)).sum()))
+        potential = (active_masses * heights).sum() + (resting_masses * resting_heights).sum()
         rows["potential_energy"].append(GRAVITY * float(potential))
     ended = history.ends.cpu() < history.frames
-    # Droplets of a splash are part of drops that have ended: what such a drop left behind is the rest of it.
+    # Splash droplets are part of drops that have ended, so their mass does not count as emitted, and only the rest of such a
+    # drop is gone.
     droplets = (history.kinds.cpu() & SPLASHED) > 0
     emitted = float(masses[~droplets].sum())
     gone = float(masses[ended & ~history.collided.cpu()].sum()) - float(masses[droplets].sum())
