@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.effects.effect import Wind
-from pgsd_nerfstudio.physics.air.deflection import MOST, Deflection, Faces, Lattice, mass_consistent, open_faces
+from pgsd_nerfstudio.physics.air.deflection import Deflection
+from pgsd_nerfstudio.physics.air.obstacle_flow import MOST, Faces, Lattice, mass_consistent, open_faces
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
