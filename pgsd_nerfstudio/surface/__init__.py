@@ -1,1 +1,1 @@
-
+"""The surface of a scene, on which particles land: a triangle mesh in metres, and the signed distance to it."""
