@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
@@ -230,7 +231,8 @@ def _views(cameras: Cameras) -> Cameras:
 def _render_depths(scene: Scene, device: torch.device, cameras: Cameras, progress: bool) -> list[Float[Tensor, "h w"]]:
     """Depth in metres; 0 where the solid part is half transparent, inf where it is absent and the sky shows."""
     rasterizer, depths = choose_rasterizer(solid(scene.gaussians), device), []
-    for index in track(range(len(cameras)), "Surface: depth of the training views", disable=not progress, transient=True):
+    shown = {"console": Console(stderr=True), "disable": not progress, "transient": True}
+    for index in track(range(len(cameras)), "Surface: depth of the training views", **shown):
         seen = rasterizer.render(cameras[index].to(device))
         depth, accumulation = seen.depth[0].cpu() * scene.frame.metres_per_unit, seen.accumulation[0].cpu()
         depth = torch.where(accumulation > 0.5, depth, 0.0)
