@@ -4,7 +4,8 @@ Everything is in metres of the metric frame (z up, ground at z = 0), kilograms a
 several real ones (`history.represents`); masses are those of the real ones. The weather is that of the first example: where
 that was run, its motion comes from the cache.
 
-Writes positions.csv, the places of all particles at second 3, and report.json: particles, mass, momentum and energy by frame.
+Writes positions.csv, the places of all particles at second 3; report.json, particles, mass, momentum and energy by frame; and
+a folder, from which `Weather.open` makes the same weather again, on any machine that has the scene.
 
     python examples/04_positions_and_reports.py --output numbers
 """
@@ -26,7 +27,10 @@ def main(output: Path = Path("numbers")) -> None:
     places, report = output / "positions.csv", output / "report.json"
     np.savetxt(places, weather.positions(3.0).numpy(force=True), fmt="%.4f", delimiter=",", header="x,y,z", comments="")
     report.write_text(json.dumps(weather.report(), indent=1))
-    print(places, report, sep="\n")
+    folder = weather.save(output / "weather")
+    again = pgsd_nerfstudio.Weather.open(folder, scene)
+    assert again.positions(3.0).equal(weather.positions(3.0))
+    print(places, report, folder, sep="\n")
 
 
 if __name__ == "__main__":

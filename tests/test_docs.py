@@ -142,3 +142,8 @@ def test_forms_for_issues_ask_something(form: Path):
         assert any(part.get("validations", {}).get("required") for part in asked["body"])
         ids = [part["id"] for part in asked["body"]]
         assert len(ids) == len(set(ids))
+
+
+def test_the_page_of_the_public_names_has_all_of_them():
+    page = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
+    assert {*re.findall(r"^        - (\w+)$", page, re.MULTILINE)} == {*pgsd_nerfstudio.__all__} - {"__version__"}
