@@ -1,4 +1,4 @@
-"""The small encoder against a plain twin that walks frame by frame, and what it says to files that are none."""
+"""The tiny encoder against a plain twin that walks frame by frame, and what it says to files that are none."""
 
 import pickle
 
@@ -132,11 +132,11 @@ def test_a_gradient_of_zero_has_no_direction(tiny):
 
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory) -> CogVideoXPrior:
-    """A random prior with 16 latent channels, which the small encoder fits."""
+    """A random prior with 16 latent channels, which the tiny encoder fits."""
     return CogVideoXPrior.load(write_tiny(tmp_path_factory.mktemp("prior16"), latent_channels=16))
 
 
-def test_a_prior_encodes_through_the_small_encoder_and_is_itself_unchanged(prior, tiny):
+def test_a_prior_encodes_through_the_tiny_encoder_and_is_itself_unchanged(prior, tiny):
     clip = torch.rand(9, 3, 32, 48)
     own = prior.encode(clip)
     cheap = prior.through(tiny)

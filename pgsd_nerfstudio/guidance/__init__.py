@@ -1,4 +1,4 @@
-"""TAUGHT: video diffusion. Sees only clips, knows nothing of Gaussians."""
+"""Score distillation from a video diffusion model. This room sees only clips and knows nothing of Gaussians."""
 
 from pgsd_nerfstudio.guidance.cogvideox import CogVideoXPrior
 from pgsd_nerfstudio.guidance.distillation import DistillationConfig, Distilled, DistilledClip, distill, distill_clip

@@ -43,7 +43,7 @@ class CogVideoXPrior(VideoPrior):
         self._rotary: dict[tuple[int, int, int], Any] = {}
 
     def through(self, tiny: TinyEncoder) -> VideoPrior:
-        """The same prior with a small encoder in place of its VAE's in `encode`, for a cheaper and less exact gradient.
+        """The same prior with a tiny encoder in place of its VAE's in `encode`, for a cheaper and less exact gradient.
 
         Raises:
             PriorError: this prior's latents are of another shape.

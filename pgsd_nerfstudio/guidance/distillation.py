@@ -102,7 +102,7 @@ class Distilled(NamedTuple):
 
 
 class DistilledClip(NamedTuple):
-    """The same, carried back through the VAE to the pixels."""
+    """One evaluation of the video prior, with its gradient carried back through the VAE to the pixels."""
 
     gradient: Float[Tensor, "t 3 h w"]
     """Of the loss with respect to the clip."""
@@ -122,7 +122,7 @@ def distill(
     frames: int = 1,
     progress: float | None = None,
 ) -> Distilled:
-    """Score distillation on latents.
+    """Ask the prior how latents should change.
 
     Args:
         prior: the video diffusion model.
@@ -169,10 +169,18 @@ def distill_clip(
     generator: torch.Generator,
     progress: float | None = None,
 ) -> DistilledClip:
-    """Score distillation for a rendered clip in 0..1, with one pass through the VAE's encoder and back.
+    """Ask the prior how a rendered clip should change, with one pass through the VAE's encoder and back.
 
-    The clip's own graph is not touched: the caller carries `gradient` on, frame by frame if memory is short. The arguments are
-    those of `distill`.
+    Args:
+        prior: the video diffusion model.
+        clip: frames in 0..1. Their own graph is not touched: the caller carries `gradient` on, frame by frame if memory is
+            short.
+        text: as `distill` takes it.
+        negative: as `distill` takes it.
+        timestep: noise level, 0 .. steps - 1.
+        config: kind, weights and bounds.
+        generator: source of the noise, on the CPU.
+        progress: share of the training that is done; only bridge needs it.
 
     Raises:
         FloatingPointError: a prediction or the encoder's gradient is not finite; the message names the timestep.

@@ -1,4 +1,4 @@
-"""Where a video prior lies: a diffusers folder of a text-to-video model, on this disk or on the Hugging Face hub.
+"""Folders of video priors: what diffusers writes of a text-to-video model, on this disk or on the Hugging Face hub.
 
 Everything is judged before any weight is read, so that a wrong path costs one sentence and no minutes.
 """
@@ -15,7 +15,7 @@ from typing import Any
 
 BUNDLED = Path(__file__).parent / "bundled"
 PARTS = ("transformer", "vae", "scheduler", "text_encoder", "tokenizer")
-"""Subfolders of such a model."""
+"""Subfolders of a text-to-video model."""
 CONFIGS = {"scheduler": "scheduler_config.json", "tokenizer": "tokenizer_config.json"}
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 SAMPLED_BLOCKS, BLOCK_BYTES = 64, 1 << 14
@@ -30,6 +30,7 @@ class Family:
     """What tells one family of text-to-video models from another, in the words of their configurations."""
 
     name: str
+    """As the family is called in messages."""
     classes: Mapping[str, str]
     """Class that a part's configuration must name, by part."""
     channels: str
@@ -58,7 +59,10 @@ def find_prior(place: str | Path, family: Family) -> Path:
 
 
 def find_folder(place: str | Path) -> Path:
-    """The same, whatever is in it: a video prior of any family, or none at all.
+    """The folder of a model, not yet judged: it may hold a video prior of any family, or none at all.
+
+    Args:
+        place: as `find_prior` takes it.
 
     Raises:
         PriorError: there is no such folder or model.
@@ -82,7 +86,7 @@ def is_of(folder: Path, family: Family) -> bool:
 def fingerprint(folder: Path) -> str:
     """Identity of the files below a folder, from their names, sizes and 64 blocks of 16 KiB of each.
 
-    Enough to tell two trainings apart without reading gigabytes of a text encoder.
+    This is enough to tell two trainings apart without reading gigabytes of a text encoder.
     """
     digest = hashlib.sha256()
     for file in sorted(p for p in folder.rglob("*") if p.is_file()):
@@ -96,7 +100,7 @@ def fingerprint(folder: Path) -> str:
 
 
 def stored_dtype(folder: Path) -> str:
-    """Number format of the first weight stored in a component's folder, as safetensors writes it: F16, BF16, F32."""
+    """Number format of the first weight stored in the folder of a part, as safetensors writes it: F16, BF16, F32."""
     from safetensors import safe_open
 
     with safe_open(min(folder.glob("*.safetensors")), framework="pt") as stored:
@@ -104,7 +108,7 @@ def stored_dtype(folder: Path) -> str:
 
 
 def read_config(folder: Path, part: str) -> dict[str, Any]:
-    """Configuration of one component.
+    """Configuration of one of the `PARTS`.
 
     Raises:
         PriorError: the file is missing or no JSON.

@@ -2,8 +2,8 @@
 
 Every tensor that an operator makes has a storage; its bytes count from the operator's return until the storage is freed, which
 the interpreter reports through a weak reference. Tensors that autograd saves for the backward pass are kept alive by the graph
-and so are counted like any other. Not counted: what a kernel needs inside itself (workspace of cuDNN) and what an allocator
-keeps beside (fragments, the CUDA context).
+and so are counted like any other. The count leaves out what a kernel needs inside itself (workspace of cuDNN) and what an
+allocator keeps beside (fragments, the CUDA context).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class MemoryMeter(TorchDispatchMode):
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Keep the peak of what happens within also under a name; phases may be nested, and entered again."""
+        """Keep the peak of what happens within under a name too; phases may be nested, and entered again."""
         self.phases[name] = max(self.phases.get(name, 0), self.live)
         self._running.append(name)
         try:

@@ -1,8 +1,8 @@
-"""What the video prior is told and asked about, for each kind of score distillation. Texts only; each is encoded once.
+"""Texts that the video prior is asked about, for each kind of score distillation; each is encoded once.
 
 The words against flaws are those published with the methods: NFSD's negative text in Katzir et al. (2023), the suffixes of
-Bridge-SDS in the code of McAllister et al. (2024). They were written for clear portraits of single things, and some of them
-name what a weather is; those are left out (`BELONGS`), else the prior would be led away from the very thing it is asked for.
+Bridge-SDS in the code of McAllister et al. (2024). They were written for clear portraits of single things. Some of them name
+what a weather is and are left out (`BELONGS`), else the prior would lead away from the very thing it is asked for.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ BELONGS: dict[str, frozenset[str]] = {
     # Flakes all over the picture look like noise and veil the distance, under a grey sky. The ground is bright: dark is a flaw.
     "snowfall": _VEIL | _OVERCAST | {"noisy"},
 }
-"""Words of the published lists that name what an effect is, hence no flaws of it."""
+"""Words of the published lists that name what an effect is, by effect; they are no flaws of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,15 +65,15 @@ class Prompts:
     text: str
     """What is wanted."""
     negative: str
-    """What is not, as the effect has it."""
+    """What is not wanted, as the effect has it."""
     flaws: str
-    """NFSD: how a bad video looks."""
+    """How a bad video looks, for NFSD."""
     target: str
-    """Bridge: what is wanted, in high quality."""
+    """What is wanted, in high quality, for Bridge-SDS."""
     source: str
-    """Bridge: what is wanted, with the flaws that stage one leaves."""
+    """What is wanted, with the flaws that stage one leaves, for Bridge-SDS."""
     empty: str = ""
-    """NFSD: nothing said."""
+    """The empty text, for NFSD."""
 
     def needed(self, variant: Variant) -> dict[Role, str]:
         """The texts that a variant asks about; the others need not be encoded.
@@ -93,7 +93,7 @@ class Listener(Protocol):
 def prompts_for(effect: str, prompt: str, negative_prompt: str, description: str) -> Prompts:
     """All texts for an effect in a scene.
 
-    From the published lists of flaws those are left out that name what the effect is:
+    Words of the published lists of flaws are left out that name what the effect is:
 
     - fog: foggy, hazy, low contrast, dull, gloomy, blurry, out of focus, smooth
     - rainfall: foggy, hazy, low contrast, dull, gloomy, dark
@@ -101,8 +101,8 @@ def prompts_for(effect: str, prompt: str, negative_prompt: str, description: str
     - snowfall: foggy, hazy, low contrast, dull, gloomy, noisy
     - an effect of another name: all of these, since any of them may be what it is
 
-    and for every effect those that the prompt itself asks for, such as "cartoon snowflakes". The effect's own negative prompt
-    was written for it and stays as it is.
+    So are, for every effect, words that the prompt itself asks for, such as "cartoon snowflakes". The effect's own negative
+    prompt was written for it and stays as it is.
 
     Args:
         effect: name of the effect, such as "snowfall".
@@ -119,7 +119,7 @@ def prompts_for(effect: str, prompt: str, negative_prompt: str, description: str
 
 
 def embed_texts(prior: Listener, texts: Mapping[Role, str]) -> dict[Role, Float[Tensor, "1 l d"]]:
-    """Embeddings by role, in one pass of the text encoder; to be kept for the whole training."""
+    """Embeddings by role, in one pass of the text encoder; the caller keeps them for the whole training."""
     return dict(zip(texts, prior.encode_prompt(list(texts.values())).split(1), strict=True))
 
 

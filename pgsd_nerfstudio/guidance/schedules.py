@@ -21,7 +21,7 @@ class TimestepSchedule:
     t_max_first: int = 980
     """Largest timestep at the start of training."""
     t_max_last: int = 740
-    """Largest timestep at its end."""
+    """Largest timestep at the end of training."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.t_min <= min(self.t_max_first, self.t_max_last):
@@ -30,12 +30,23 @@ class TimestepSchedule:
             )
 
     def t_max(self, step: int, steps: int) -> int:
-        """Largest timestep (inclusive) at training step `step` of `steps`."""
+        """Largest timestep (inclusive) at one step of a training.
+
+        Args:
+            step: training step, counted from 0; one past the end counts as the last.
+            steps: length of the training.
+        """
         progress = min(max(step / max(steps - 1, 1), 0.0), 1.0)
         return round(self.t_max_first + progress * (self.t_max_last - self.t_max_first))
 
     def sample(self, step: int, steps: int, generator: torch.Generator) -> int:
-        """A timestep for training step `step` of `steps`."""
+        """A timestep for one step of a training.
+
+        Args:
+            step: training step, counted from 0.
+            steps: length of the training.
+            generator: source of the draw.
+        """
         return int(torch.randint(self.t_min, self.t_max(step, steps) + 1, (), generator=generator))
 
 

@@ -1,6 +1,6 @@
-"""Prompts as the numbers a video prior listens to. Each text is encoded once, ever: the embedding is cached on disk.
+"""Embeddings of texts, as a video prior takes them. Each text is encoded once, ever: its embedding is cached on disk.
 
-The text encoder is by far the largest part of CogVideoX (T5-XXL, 4.7 billion parameters): it is loaded only for texts that are
+The text encoder is by far the largest part of CogVideoX (T5-XXL, 4.7 billion parameters). It is loaded only for texts that are
 not in the cache, and dropped at once.
 """
 
@@ -26,7 +26,14 @@ class PromptEncoder:
     """Name of the text encoder's class in transformers."""
 
     def __init__(self, folder: Path, length: int, device: torch.device, dtype: torch.dtype) -> None:
-        """`length` tokens per text (the transformer's max_text_seq_length); texts are padded or cut to it."""
+        """Remember where the text encoder lies; nothing is loaded yet.
+
+        Args:
+            folder: of the prior, with text_encoder and tokenizer in it.
+            length: tokens per text; texts are padded or cut to it.
+            device: where embeddings are made and handed out.
+            dtype: number format of the text encoder and of its embeddings.
+        """
         self._folder, self._length, self._device, self._dtype = folder, length, device, dtype
         self._identity = content_key(fingerprint(folder / "text_encoder"), fingerprint(folder / "tokenizer"), length)
         self._known: dict[str, Tensor] = {}
@@ -73,15 +80,20 @@ class PromptEncoder:
         return embeddings
 
     def _embedding(self, encoder: Any, ids: Int[Tensor, " l"]) -> Float[Tensor, "l d"]:
-        """As in CogVideoX' pipeline: padded to full length, and the padding attends and is attended to."""
+        """One text as CogVideoX' pipeline embeds it: padded to full length; the padding attends and is attended to."""
         return encoder(ids[None])[0][0]
 
 
 def token_ids(folder: Path, texts: Sequence[str], length: int) -> Int[Tensor, "n l"]:
-    """T5 tokens of texts, closed by the end token, cut or padded to `length`.
+    """T5 tokens of texts, closed by the end token.
 
     CogVideoX ships a bare SentencePiece model. transformers' conversion of one needs a newer protobuf than nerfstudio allows,
-    so it is asked directly; the tokens are the same.
+    so the model is asked directly; the tokens are the same.
+
+    Args:
+        folder: the tokenizer's.
+        texts: any strings.
+        length: tokens per text; texts are padded or cut to it.
     """
     model = folder / "spiece.model"
     if model.is_file() and not (folder / "tokenizer.json").is_file():

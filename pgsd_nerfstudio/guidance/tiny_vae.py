@@ -1,17 +1,17 @@
-"""A small encoder in place of the VAE's: the gradient on a clip for a fiftieth of the arithmetic, and less exact.
+"""A tiny encoder in place of the VAE's: it gives the gradient on a clip for a fiftieth of the arithmetic, and less exactly.
 
 Boer Bohan, TAEHV (2025, https://github.com/madebyollin/taehv): an encoder of 3x3 convolutions, distilled to give the
-scaled latents of a large video VAE. Its weights for CogVideoX are called taecvx; download them yourself. Layout, by the names
-of its tensors: three stages that each merge neighbouring frames (2, 2, 1), halve the picture and pass three blocks that see
-their own input of the frame before; pixels in 0..1, no scaling factor. The same shapes serve other video models, so that a
-wrong file cannot be recognised by them: look at `gradient_cosine`.
+scaled latents of a large video VAE. Its weights for CogVideoX are called taecvx; download them yourself. The names of its
+tensors show the layout: three stages each merge neighbouring frames (2, 2, 1), halve the picture and pass three blocks that see
+their own input of the frame before. It takes pixels in 0..1 and needs no scaling factor. The same shapes serve other video
+models, so that shapes do not give a wrong file away: look at `gradient_cosine`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -22,13 +22,14 @@ from pgsd_nerfstudio.guidance.folder import PriorError
 
 WIDTH, LATENT_CHANNELS = 64, 16
 MERGED = (2, 2, 1)
-"""Frames that each stage makes one of."""
+"""Frames that each stage makes into one."""
 SPACE, TIME = 8, 4
 """Pixels per latent along an edge, frames per latent."""
 NAMES = ("taecvx.safetensors", "taecvx.pth")
 Padding = Literal["front", "end"]
 
 
+@runtime_checkable
 class Encoder(Protocol):
     """Whatever makes scaled latents of a clip, differentiably: a `VideoPrior` or a `TinyEncoder`."""
 
@@ -70,9 +71,9 @@ class TinyEncoder(nn.Module):
     """
 
     padding: Padding
-    """Where frames are repeated to fill whole groups of 4. front: the first one, so that a clip of 4k + 1 frames is grouped as
-    in CogVideoX (1, 4, 4, ...) and a latent's gradient reaches its own frames. end: the last one, as the published encoder does
-    for any clip; its groups lie up to three frames later than CogVideoX's."""
+    """Where frames are repeated to fill whole groups of 4. front repeats the first one, so that a clip of 4k + 1 frames is
+    grouped as in CogVideoX (1, 4, 4, ...) and a latent's gradient reaches its own frames. end repeats the last one, as the
+    published encoder does for any clip; its groups lie up to three frames later than CogVideoX'."""
 
     def __init__(self, padding: Padding = "front") -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Kinds of score distillation: which texts the video prior is asked about, and how its answers become one direction.
+"""Kinds of score distillation: which texts the video prior is asked about, and how its predictions become one gradient.
 
 With a = sqrt(alpha_bar), s = sqrt(1 - alpha_bar), x_t = a x0 + s eps and v = a eps - s x0, every prediction of noise is
 eps_hat = s x_t + a v_hat. Differences of predictions are a (v_1 - v_2): alpha_bar = 0 at the last timestep is no trouble.
@@ -53,7 +53,13 @@ class Noised(NamedTuple):
 
 
 def noised(latents: Float[Tensor, "1 lt c lh lw"], alpha_bar: float, generator: torch.Generator) -> Noised:
-    """Latents with Gaussian noise; drawn on the generator's device, so that a CPU generator gives every device the same."""
+    """Put Gaussian noise on latents.
+
+    Args:
+        latents: clean ones.
+        alpha_bar: share of signal power that is left, 0..1.
+        generator: source of the noise, which is drawn on its device: a CPU generator gives every device the same.
+    """
     a, s = alpha_bar**0.5, (1.0 - alpha_bar) ** 0.5
     noise = torch.randn(latents.shape, generator=generator).to(latents)
     return Noised(latents, noise, a * latents + s * noise, a, s)
@@ -72,10 +78,10 @@ def roles_of(variant: Variant) -> tuple[Role, ...]:
 
 
 def require_roles(variant: Variant, embeddings: Embeddings) -> None:
-    """Judge embeddings before the first step, not where the missing one is needed.
+    """Check that embeddings are complete, before the first step and not where the missing one is needed.
 
     Raises:
-        ValueError: some that the variant needs are missing; the message names them.
+        ValueError: embeddings are missing that the variant needs; the message names them.
     """
     missing = [role for role in roles_of(variant) if role not in embeddings]
     if missing:
@@ -87,7 +93,14 @@ def require_roles(variant: Variant, embeddings: Embeddings) -> None:
 
 
 def rule_at(variant: Variant, timestep: int, threshold: int, progress: float | None, start: float) -> Rule:
-    """What to do at this timestep (nfsd: fine below `threshold`) and share of the training (bridge: stage two from `start`).
+    """What one step of a training does.
+
+    Args:
+        variant: kind of score distillation.
+        timestep: noise level of the step.
+        threshold: timestep t* of nfsd.
+        progress: share of the training that is done, 0..1; only bridge needs it.
+        start: share of the training after which bridge is in stage two.
 
     Raises:
         ValueError: bridge has not been told its progress in 0..1, or the variant is unknown.
@@ -102,7 +115,7 @@ def rule_at(variant: Variant, timestep: int, threshold: int, progress: float | N
 
 
 def weight_on_v(omega: Omega, a: float, s: float) -> float:
-    """Weight of a difference of v-predictions; the weight of the noise's difference times a, without a division.
+    """Weight of a difference of v-predictions: that of the difference of noises times a, without a division.
 
     Raises:
         ValueError: there is no such omega; the message names the known ones.

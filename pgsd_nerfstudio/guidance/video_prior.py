@@ -1,6 +1,6 @@
 """What a video prior promises, whatever its family: a frozen text-to-video model as a function on clips.
 
-The families are CogVideoX (`cogvideox`) and Wan (`wan`); `load_prior` opens a model of either. Only diffusers' own components
+The families are CogVideoX (`cogvideox`) and Wan (`wan`); `load_prior` opens a model of either. Only diffusers' own models
 compute. A prior knows nothing of Gaussians.
 """
 
@@ -60,7 +60,7 @@ class VideoPrior(ABC):
     """alpha_bar of every timestep, float64, on the CPU."""
 
     def __init__(self, folder: Path, transformer: Any, vae: Any, schedule: Any, frames: int | None = None) -> None:
-        """Build a prior from diffusers components; `load` is the usual way.
+        """Build a prior from parts that diffusers made; `load` is the usual way.
 
         Args:
             folder: where the text encoder and its tokenizer lie.
@@ -138,7 +138,7 @@ class VideoPrior(ABC):
 
     @abstractmethod
     def through(self, tiny: TinyEncoder) -> VideoPrior:
-        """The same prior with a small encoder in place of its VAE's in `encode`, for a cheaper and less exact gradient.
+        """The same prior with a tiny encoder in place of its VAE's in `encode`, for a cheaper and less exact gradient.
 
         Raises:
             PriorError: this prior has other latents.

@@ -55,7 +55,7 @@ def recompute_blocks(vae: Any) -> None:
     """Let a Wan VAE's encoder keep only what goes into each residual block for the backward pass, and make the rest again.
 
     diffusers' AutoencoderKLWan has no switch for it, since a block also reads and writes the cache that joins its chunks of
-    frames. Here the block's two entries of that cache go in and come out like its other values.
+    frames. Here a block's two entries of that cache go in and come out like its other values.
     """
     from diffusers.models.autoencoders.autoencoder_kl_wan import WanResidualBlock
 
@@ -79,7 +79,7 @@ def _recomputed(forward: Any) -> Any:
 
 
 class WanPromptEncoder(PromptEncoder):
-    """Embeddings by UMT5 as diffusers' pipeline makes them: cleaned texts, padding neither attended to nor passed on."""
+    """Embeddings by UMT5 as diffusers' pipeline makes them: texts are cleaned, padding is neither attended to nor passed on."""
 
     encoder_class = "UMT5EncoderModel"
 
@@ -92,9 +92,9 @@ class WanPromptEncoder(PromptEncoder):
 
 
 def cleaned(text: str) -> str:
-    """A text as Wan's pipeline cleans it: HTML entities resolved, runs of white space made one space.
+    """A text as Wan's pipeline cleans it: HTML entities are resolved, runs of white space become one space.
 
-    Where ftfy is installed, what was garbled by a wrong encoding is repaired too; plain texts are the same without it.
+    Where ftfy is installed, it repairs what a wrong encoding has garbled; plain texts are the same without it.
     """
     if importlib.util.find_spec("ftfy"):
         text = importlib.import_module("ftfy").fix_text(text)

@@ -1,4 +1,4 @@
-"""CogVideoX of a few thousand random parameters: with diffusers' own components, for checks that need no trained weights."""
+"""CogVideoX of a few thousand random parameters, made by diffusers: for checks that need no trained weights."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def _bundled() -> tuple[VideoPrior, Tensor, Tensor]:
 
 
 def _random_prior() -> CogVideoXPrior:
-    """It never was on disk and has no text encoder."""
+    """A prior that never was on disk and has no text encoder."""
     return CogVideoXPrior(Path("random"), *tiny_models(), scheduler_2b())
 
 

@@ -40,7 +40,7 @@ class Arrangement:
     twice: bool = False
     """Encode without a graph, evaluate the guidance pair, then encode again for the gradient."""
     tiny: bool = False
-    """Let the gradient pass the small encoder taecvx; the VAE's weights stay loaded."""
+    """Let the gradient pass the tiny encoder taecvx; the VAE's weights stay loaded."""
 
 
 USED = Arrangement()
@@ -59,7 +59,7 @@ class Count(NamedTuple):
     parameters: int
     """Of the transformer; a number, not bytes."""
     weights: int
-    """Of transformer and VAE (and small encoder)."""
+    """Of transformer and VAE (and tiny encoder)."""
     peak: int
     phases: dict[str, int]
     """Peak of each: look, encode, pair, backward."""
