@@ -1,4 +1,4 @@
-"""Figures of the room rendering: the CPU rasterizer beside its float64 judge; what a frame costs is in bench_rasterizer.py."""
+"""Figures of the room rendering: the CPU rasterizer beside its float64 judge; rasterizer.py measures what a frame costs."""
 
 from __future__ import annotations
 
