@@ -1,5 +1,5 @@
-"""Figures of what is in the air: fall speeds and rain against published ones, the balance of wetness, and what flight and the
-distance grid cost beside their errors."""
+"""Figures of particles in the air: terminal speeds and rain against published values, the balance of wetness, and the costs of
+flight, distance grid and wetness beside their errors."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 from pgsd_nerfstudio.effects.effect import Wind
 from pgsd_nerfstudio.effects.snowfall import fall_speed
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.surfaces import damaged_ball, floor_and_table
 from pgsd_nerfstudio.laboratory.timing import best
 from pgsd_nerfstudio.physics.air.airborne import Flutter, advance
 from pgsd_nerfstudio.physics.air.wind import WindField
@@ -35,7 +36,6 @@ from pgsd_nerfstudio.physics.laws.size_distributions import (
     with_rain_rate,
 )
 from pgsd_nerfstudio.surface.distance import DistanceGrid
-from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 GUNN_KINZER_1949 = {0.5: 2.06, 1.0: 4.03, 2.0: 6.49, 3.0: 8.06, 4.0: 8.83, 5.0: 9.09}  # mm: m/s
 _GUNN_KINZER = "Gunn & Kinzer 1949, table 2, as PySDM and CloudMicrophysics.jl reprint it; law: Beard 1976"
@@ -43,7 +43,7 @@ _DOMAIN = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 2.0))
 
 
 def cases(quick: bool) -> list[Record]:
-    """Published values and laws with known answers."""
+    """Published values and laws with known answers; `quick` simulates fewer frames."""
     return [
         *(_rain(mm, speed) for mm, speed in GUNN_KINZER_1949.items()),
         _drizzle(),
@@ -58,7 +58,7 @@ def cases(quick: bool) -> list[Record]:
 
 
 def costs(quick: bool) -> list[Record]:
-    """Cost beside error."""
+    """Costs beside errors; `quick` times fewer calls on a coarser grid."""
     return [*_flight(quick), *_distance(quick), *_wetting(quick)]
 
 
@@ -123,8 +123,8 @@ def _visibility() -> Record:
 
 
 def _balance(frames: int) -> Record:
-    grid, rng = WetnessGrid.of(_yard(), _DOMAIN, Wetting(diffusivity=2e-4, drying_seconds=60.0)), np.random.default_rng(0)
-    given = 0.0
+    grid = WetnessGrid.of(floor_and_table(), _DOMAIN, Wetting(diffusivity=2e-4, drying_seconds=60.0))
+    rng, given = np.random.default_rng(0), 0.0
     for _ in range(frames):
         points = np.column_stack([rng.uniform(-1.9, 1.9, (500, 2)), np.zeros(500)])
         water = rng.uniform(0, 1e-6, 500)
@@ -148,7 +148,7 @@ def _spread() -> Record:
 
 
 def _flight(quick: bool) -> list[Record]:
-    """100,000 particles in gusty wind, for each kind of speed; errors of 200 of them after a second."""
+    """Throughput of 100,000 particles in gusty wind for each law of terminal speed, and errors of 200 of them after 1 s."""
     count, wind, rng = 100_000, WindField.draw(Wind(), 7), np.random.default_rng(0)
     kinds = {
         "snow": fall_speed(rng.uniform(0.0015, 0.012, count)),
@@ -171,7 +171,7 @@ def _flight(quick: bool) -> list[Record]:
                 f"airborne {name}, {count:,} particles",
                 count / seconds / 1e6,
                 "million particle-frames/s",
-                1e3 * _integration_error(wind, *few),
+                1e3 * integration_error(wind, *few),
                 "mm",
                 source="error against steps of 1/64 of a frame in float64, mean of 200 particles after 1 s of gusty wind",
             )
@@ -179,7 +179,13 @@ def _flight(quick: bool) -> list[Record]:
     return rows
 
 
-def _integration_error(wind: WindField, *start: np.ndarray) -> float:
+def integration_error(wind: WindField, *start: np.ndarray) -> float:
+    """Mean error in metres after 1 s of steps of a frame in float32, against steps of 1/64 of a frame in float64.
+
+    Args:
+        wind: the moving air.
+        start: positions (m), velocities (m/s) and terminal speeds (m/s).
+    """
     ends = []
     for parts, dtype in ((1, np.float32), (64, np.float64)):
         position, velocity, speed = (value.astype(dtype) for value in start)
@@ -190,10 +196,10 @@ def _integration_error(wind: WindField, *start: np.ndarray) -> float:
 
 
 def _distance(quick: bool) -> list[Record]:
-    """A ball of radius 0.5 m with 5 % of its triangles gone and 30 % turned around."""
+    """Distance grid of a ball of radius 0.5 m with 5 % of its triangles missing and 30 % flipped."""
     cell, center = 0.05 if quick else 0.025, np.array([0.03, -0.01, 0.7])
-    mesh = _damaged_ball(center, 0.5)
-    mesh.closest(torch.zeros(1, 3))  # builds the tree
+    mesh = damaged_ball(center, 0.5)
+    mesh.closest(torch.zeros(1, 3))  # build the tree before the clock starts
     began = time.perf_counter()
     grid = DistanceGrid.of(mesh, np.array([-1.0, -1.0, -0.2]), np.array([1.0, 1.0, 1.6]), cell)
     seconds = time.perf_counter() - began
@@ -215,7 +221,7 @@ def _distance(quick: bool) -> list[Record]:
 
 
 def _wetting(quick: bool) -> list[Record]:
-    grid, rng = WetnessGrid.of(_yard(), _DOMAIN), np.random.default_rng(0)
+    grid, rng = WetnessGrid.of(floor_and_table(), _DOMAIN), np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-1.9, 1.9, (400, 2)), np.zeros(400)])
     water = np.full(400, 1e-6)
     grid.deposit(points, water)
@@ -228,23 +234,3 @@ def _wetting(quick: bool) -> list[Record]:
         Record("wetness for one frame, 400 drops", 1e3 * (depositing + stepping), "ms", error, "of the water", source=size),
         Record("wetness: memory", grid.bytes / 2**20, "MiB", source=size),
     ]
-
-
-def _yard() -> SurfaceMesh:
-    """A floor of 8 m and a table of 1.6 m at 0.75 m."""
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    vertices = torch.cat([4 * corners, 0.8 * corners + torch.tensor([0, 0, 0.75])])
-    return SurfaceMesh(vertices, torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=torch.int32))
-
-
-def _damaged_ball(center: np.ndarray, radius: float) -> SurfaceMesh:
-    rings, sides = 64, 128
-    polar, turn = np.meshgrid(np.pi * np.arange(rings + 1) / rings, 2 * np.pi * np.arange(sides) / sides, indexing="ij")
-    unit = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], -1).reshape(-1, 3)
-    ring, side = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
-    a, b = (ring * sides + side).ravel(), (ring * sides + (side + 1) % sides).ravel()
-    triangles = np.concatenate([np.stack([a, a + sides, b + sides], 1), np.stack([a, b + sides, b], 1)])
-    rng = np.random.default_rng(0)
-    triangles = np.where(rng.uniform(size=len(triangles))[:, None] < 0.3, triangles[:, ::-1], triangles)
-    kept = triangles[rng.uniform(size=len(triangles)) >= 0.05]
-    return SurfaceMesh(torch.from_numpy(center + radius * unit).float(), torch.from_numpy(kept.copy()).int())

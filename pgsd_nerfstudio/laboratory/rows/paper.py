@@ -1,4 +1,4 @@
-"""Figures of the paper's solver: what a particle costs when every node and every scene Gaussian is visited in every substep."""
+"""Figures of the paper's solver: the cost of a particle when every substep visits all nodes and all scene Gaussians."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOMAIN = Domain((-HALF, -HALF, -0.2), (HALF, HALF, TOP))
 
 
 def costs(quick: bool) -> list[Record]:
-    """CPU time over all threads, statics included, beside the error of single precision."""
+    """CPU time over all threads, with static Gaussians, beside the error of single precision; `quick` takes fewer tries."""
     error, rows = _single_precision_error(500 if quick else 2000), []
     cases: list[tuple[int, Stationary]] = [(0, "mass"), (20_000, "mass"), (100_000, "mass"), (100_000, "particles")]
     for static, stationary in cases:
@@ -39,12 +39,13 @@ def costs(quick: bool) -> list[Record]:
 
 
 def baseline_cpu_seconds(dynamic: int, static: int, frames: int, *, stationary: Stationary = "mass") -> float:
-    """CPU seconds, over all threads, that the paper's solver takes for `frames` frames of 4 ms; compiling is not counted.
+    """CPU seconds of the paper's solver over all threads, without compilation.
 
     Args:
-        dynamic: snow particles all over the air of a walled yard, with the published numbers and initial velocities.
-        static: Gaussians of its floor and walls.
-        stationary: "mass" is the cheapest way in which they can do what they do; "particles" is the original's.
+        dynamic: number of snow particles in the air of a walled yard, with the published numbers and initial velocities.
+        static: number of Gaussians of its floor and walls.
+        frames: number of frames of 4 ms.
+        stationary: how static Gaussians are put onto the grid, see `PaperConfig.stationary`; "mass" is cheaper.
     """
     config = replace(paper_config("snowfall"), stationary=stationary)
     _solver(config, 1, static).step()  # compiles
@@ -62,22 +63,22 @@ _SOURCE = (
 
 
 def _solver(config: PaperConfig, dynamic: int, static: int) -> PaperSolver:
-    """Particles all over the air of the yard."""
+    """A solver with `dynamic` particles in the air of a yard of `static` Gaussians."""
     box = Box.of(DOMAIN)
     means: Float[ndarray, "s 3"] = yard(static).means.numpy().astype(np.float64) if static else np.zeros((0, 3))
     solver = PaperSolver(config, box, box.to_box(means))
     rng = np.random.default_rng(0)
     slowest, fastest = np.array(config.velocity).T
-    # A little above the ground, so that none leaves within the frames that are measured.
+    # Particles start a little above the ground, so that none leaves within the measured frames.
     low = box.bounds[0] + np.array([0.02, 0.02, 0.1])
     solver.emit(rng.uniform(low, box.bounds[1] - 0.02, (dynamic, 3)), rng.uniform(slowest, fastest, (dynamic, 3)))
     return solver
 
 
 def _single_precision_error(count: int) -> float:
-    """Mean distance in boxes after 10 frames."""
+    """Mean distance in boxes between single and double precision after 10 frames."""
     ends = []
-    for precision in ("f64", "f32"):  # single last: what follows runs in it
+    for precision in ("f64", "f32"):  # single precision last, since later rows run in it
         solver = _solver(replace(paper_config("snowfall"), precision=precision), count, 0)
         for _ in range(10):
             solver.step()

@@ -1,4 +1,4 @@
-"""Figures of the room physics: laws that its flakes obey, and what a particle costs for a frame."""
+"""Figures of the room physics: laws of the simulated particles, and the cost of a particle per frame."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pgsd_nerfstudio.effects.snowfall import fall_speed, mass
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows import air_cases as rows_air_cases
 from pgsd_nerfstudio.laboratory.rows import regimes as rows_regimes
+from pgsd_nerfstudio.laboratory.surfaces import floor_and_table
 from pgsd_nerfstudio.laboratory.timing import best
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, WindField, simulate_metric
 from pgsd_nerfstudio.physics.air.airborne import Flutter, advance
@@ -24,8 +25,8 @@ DOMAIN = Domain((-3.0, -3.0, -0.2), (3.0, 3.0, 4.0))
 
 
 def verify(quick: bool) -> list[Record]:
-    """Laws with known answers."""
-    run = simulate_metric(_yard(), SNOWFALL, Clock(frames=100), DOMAIN, max_particles=2000, progress=False)
+    """Laws with known answers; `quick` takes fewer particles and leaves out dense matter."""
+    run = simulate_metric(floor_and_table(), SNOWFALL, Clock(frames=100), DOMAIN, max_particles=2000, progress=False)
     ended = sum(run.about[kind] for kind in ("landed", "absorbed", "left", "unseen", "in_air"))
     return [
         Record.judged("free fall against analytic, float64", _fall_error(np.float64), "m", "<= 1e-9", source=_DRAG),
@@ -56,14 +57,14 @@ def verify(quick: bool) -> list[Record]:
 
 
 def bench(quick: bool) -> list[Record]:
-    """Cost beside error."""
+    """Costs beside errors; `quick` takes fewer frames and leaves out dense matter."""
     count = 20_000
-    error = _integration_error()
+    error = rows_air_cases.integration_error(_WIND, *_particles(200, np.float32))
     kernel = 1e9 * best(_kernel_step(count), 10 if quick else 50) / count
     frames = 50 if quick else 250
-    simulate_metric(_yard(), SNOWFALL, Clock(frames=3), DOMAIN, progress=False)
+    simulate_metric(floor_and_table(), SNOWFALL, Clock(frames=3), DOMAIN, progress=False)
     began = time.perf_counter()
-    run = simulate_metric(_yard(), SNOWFALL, Clock(frames=frames), DOMAIN, progress=False)
+    run = simulate_metric(floor_and_table(), SNOWFALL, Clock(frames=frames), DOMAIN, progress=False)
     seconds = time.perf_counter() - began
     rows = run.positions.shape[0]
     against = "a step of 1/64 of a frame, mean over 200 flakes after 1 s of gusty wind"
@@ -80,12 +81,12 @@ def bench(quick: bool) -> list[Record]:
 
 
 def _dense(quick: bool, kind: Literal["cases", "costs"]) -> list[Record]:
-    """Rows of the material point method; not in --quick, where compiling its kernels alone would take the time of all."""
+    """Rows of the material point method. `quick` has none, since compiling its kernels takes longer than all other rows."""
     if quick:
         return []
-    from pgsd_nerfstudio.laboratory.rows import mpm_cases as rows_mpm_cases  # start Taichi
-    from pgsd_nerfstudio.laboratory.rows import mpm_costs as rows_mpm_costs  # start Taichi
-    from pgsd_nerfstudio.laboratory.rows import paper as rows_paper  # start Taichi
+    from pgsd_nerfstudio.laboratory.rows import mpm_cases as rows_mpm_cases  # starts Taichi
+    from pgsd_nerfstudio.laboratory.rows import mpm_costs as rows_mpm_costs  # starts Taichi
+    from pgsd_nerfstudio.laboratory.rows import paper as rows_paper  # starts Taichi
 
     return rows_mpm_cases.cases(False) if kind == "cases" else [*rows_mpm_costs.costs(False), *rows_paper.costs(False)]
 
@@ -93,13 +94,6 @@ def _dense(quick: bool, kind: Literal["cases", "costs"]) -> list[Record]:
 _DRAG = "v = v_t + (v_0 - v_t) exp(-t g / v_t)"
 _SPEED = "Locatelli & Hobbs 1974, aggregates of unrimed dendrites: 0.8 D^0.16"
 _WIND = WindField.draw(SNOWFALL.wind, 7)
-
-
-def _yard() -> SurfaceMesh:
-    """A floor of 8 m and a table of 1.6 m at 0.75 m."""
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    vertices = torch.cat([4 * corners, 0.8 * corners + torch.tensor([0, 0, 0.75])])
-    return SurfaceMesh(vertices, torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=torch.int32))
 
 
 def _particles(count: int, dtype: type) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,7 +130,7 @@ def _wind_error() -> float:
 
 def _divergence() -> float:
     points, _, _ = _particles(500, np.float64)
-    points[:200, 2] -= 0.9  # where the ground calms the air
+    points[:200, 2] -= 0.9  # these points are in the air that the ground calms
     h = 1e-4
     slopes = np.stack([(_WIND.velocity(points + d, 1.0) - _WIND.velocity(points - d, 1.0)) / (2 * h) for d in h * np.eye(3)])
     return float(np.abs(np.einsum("ana->n", slopes)).max() / np.sqrt((slopes**2).sum((0, 2)).mean()))
@@ -153,7 +147,7 @@ def _fall_speed_error() -> float:
 
 
 def _water_error(quick: bool) -> float:
-    """Through a plane at 1.5 m, in still and then in windy air; the worse of the two."""
+    """Error in % of the water flux through a plane at 1.5 m: the larger one of still air and windy air."""
     clock, errors = Clock(frames=125), []
     for effect in (replace(SNOWFALL, wind=replace(SNOWFALL.wind, speed=0.0, turbulence=0.0)), SNOWFALL):
         most = 4000 if quick else 20_000
@@ -177,14 +171,3 @@ def _kernel_step(count: int):
     position, velocity, speed = _particles(count, np.float32)
     flutter = Flutter(np.full(count, 0.1, np.float32), np.full(count, 1.5, np.float32), speed)
     return lambda: advance(position, velocity, speed, flutter, _WIND, 0.3, 0.04)
-
-
-def _integration_error() -> float:
-    ends = []
-    for parts, dtype in ((1, np.float32), (64, np.float64)):
-        position, velocity, speed = _particles(200, np.float32)
-        position, velocity, speed = position.astype(dtype), velocity.astype(dtype), speed.astype(dtype)
-        for k in range(25 * parts):
-            advance(position, velocity, speed, Flutter.none(200, dtype), _WIND, 0.04 * k / parts, 0.04 / parts)
-        ends.append(position)
-    return float(np.linalg.norm(ends[0] - ends[1], axis=1).mean())

@@ -1,4 +1,4 @@
-"""Figures of whole simulations: what lands, slides, wets and heaps, and what the motion prior costs beside the paper's
+"""Figures of whole simulations: landing, sliding, wetness and cover, and the cost of the motion prior beside the paper's
 solver."""
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import torch
 
 from pgsd_nerfstudio.effects import FOG, RAINFALL, SNOWFALL, Wind
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.surfaces import FACES, floor_and_table
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate_metric
 from pgsd_nerfstudio.physics.air.deflection import Deflection
 from pgsd_nerfstudio.physics.bodies import GRAVITY, SPLASHED, Bodies
@@ -21,12 +22,11 @@ from pgsd_nerfstudio.physics.record.codec import encode
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 DOMAIN = Domain((-3.0, -3.0, -0.2), (3.0, 3.0, 4.0))
-FACES = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
 STILL = Wind(speed=0.0, turbulence=0.0, flutter=0.0)
 
 
 def cases(quick: bool) -> list[Record]:
-    """Laws that whole simulations obey."""
+    """Laws that whole simulations obey; `quick` takes fewer particles."""
     slope, volume = _heap()
     return [
         Record.judged("slider on 40 degrees, friction 0.3: acceleration", _slider_error(), "%", "<= 1", source="Coulomb"),
@@ -50,11 +50,11 @@ def cases(quick: bool) -> list[Record]:
 
 
 def costs(quick: bool) -> list[Record]:
-    """Time, memory and disk of a motion prior; with the paper's solver beside it where there is time for it."""
+    """Time, memory and disk of a motion prior, and without `quick` the ratio to the paper's solver."""
     count, frames = (60_000, 60) if quick else (250_000, 500)
     began, used = time.perf_counter(), time.process_time()
     history = simulate_metric(
-        _yard(), SNOWFALL, Clock(frames=frames), DOMAIN, max_particles=_at_once(count, frames), progress=False
+        floor_and_table(), SNOWFALL, Clock(frames=frames), DOMAIN, max_particles=_at_once(count, frames), progress=False
     )
     wall, cpu = time.perf_counter() - began, time.process_time() - used
     rows = history.positions.shape[0]
@@ -75,7 +75,11 @@ def costs(quick: bool) -> list[Record]:
 
 
 def _beside_paper(ours: float) -> list[Record]:
-    """CPU per particle and frame of the paper's solver over ours; both on this machine, one after the other."""
+    """CPU time per particle and frame of the paper's solver over that of the motion prior, measured one after the other.
+
+    Args:
+        ours: CPU time per particle and frame of the motion prior, microseconds.
+    """
     from pgsd_nerfstudio.laboratory.rows.paper import baseline_cpu_seconds  # starts Taichi
 
     rows, frames = [], 4
@@ -92,13 +96,11 @@ def _beside_paper(ours: float) -> list[Record]:
 
 
 def _at_once(count: int, frames: int) -> int:
-    """Particles in the air for `count` in all: snow stays for about 3.3 s in this yard, and what leaves comes in again."""
+    """Number of particles at once that makes about `count` in all.
+
+    A particle stays for about 2.2 s in this domain: it would fall for 3.3 s, but may leave through a side before.
+    """
     return round(count / (1 + frames / 25 / 2.2))
-
-
-def _yard() -> SurfaceMesh:
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    return SurfaceMesh(torch.cat([4 * corners, 0.8 * corners + torch.tensor([0, 0, 0.75])]), torch.cat([FACES, FACES + 4]))
 
 
 def _slider_error() -> float:
@@ -116,8 +118,8 @@ def _slider_error() -> float:
 
 
 def _heap() -> tuple[float, float]:
-    """Degrees off the angle of repose, and the relative loss of volume."""
-    cover = Cover.of(_yard(), DOMAIN, CoverConfig(repose_degrees=33.0, film=0.0))
+    """Difference of a heap's slope to the angle of repose in degrees, and the relative loss of volume."""
+    cover = Cover.of(floor_and_table(), DOMAIN, CoverConfig(repose_degrees=33.0, film=0.0))
     for _ in range(200):
         cover.deposit(np.array([[2.0, 2.0, 0.0]]), np.array([1e-4]), np.array([0.08]))
         cover.relax()
@@ -129,14 +131,18 @@ def _heap() -> tuple[float, float]:
 
 
 def _within(quick: bool) -> float:
-    run = simulate_metric(_yard(), SNOWFALL, Clock(frames=100), DOMAIN, max_particles=1500 if quick else 5000, progress=False)
+    run = simulate_metric(
+        floor_and_table(), SNOWFALL, Clock(frames=100), DOMAIN, max_particles=1500 if quick else 5000, progress=False
+    )
     foot = run.rest_positions[run.collided].clone()
     foot[:, 2] -= run.rest_covers[run.collided] + SNOWFALL.surface.settle
-    return 100 * float((_yard().closest(foot).distance < 0.005).float().mean())
+    return 100 * float((floor_and_table().closest(foot).distance < 0.005).float().mean())
 
 
 def _wet_error() -> float:
-    run = simulate_metric(_yard(), replace(RAINFALL, wind=STILL), Clock(frames=50), DOMAIN, max_particles=800, progress=False)
+    run = simulate_metric(
+        floor_and_table(), replace(RAINFALL, wind=STILL), Clock(frames=50), DOMAIN, max_particles=800, progress=False
+    )
     masses = RAINFALL.material.mass(run.diameters.double()) * run.represents.double()
     droplets = (run.kinds & SPLASHED) > 0
     last = run.positions[run.offsets[1:] - 1][:, 2]

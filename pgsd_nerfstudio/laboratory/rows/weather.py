@@ -1,4 +1,5 @@
-"""Figures of the room weather: what the eye would check, against laws. Motion and landings stand in `rows_weather_ground`."""
+"""Figures of weather in pictures against laws: fog, snow on surfaces, the first second, the sun. `weather_ground` has those of
+motion and landings."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ SECONDS = 10.0
 
 
 def verify(quick: bool) -> list[Record]:
-    """Fog along rays, layers on the demo's surfaces, the first second, the sun; then landings and streaks."""
+    """All rows of the weather; `quick` takes fewer rays and particles."""
     scene = demo_scene()
     assert scene.mesh is not None
     surface = SurfaceMesh(scene.frame.to_metric(scene.mesh[0]), scene.mesh[1])
@@ -50,8 +51,11 @@ def verify(quick: bool) -> list[Record]:
 
 
 def _fog(scene: Scene) -> Iterator[Record]:
-    """A wall at 10 to 200 m in even fog. Light from a white wall before black airlight is the transmittance itself, down to
-    1e-17; a black wall before white airlight shows 1 - T."""
+    """Transmittance T of even fog before walls at 10-200 m.
+
+    The brightness of a white wall behind black airlight is T, down to 1e-17; that of a black wall behind white airlight is
+    1 - T.
+    """
     for visibility in VISIBILITIES:
         worst = {"CPU rasterizer": 0.0, "float64 reference": 0.0}
         contrast = 0.0
@@ -77,7 +81,15 @@ def _fog(scene: Scene) -> Iterator[Record]:
 
 
 def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, reference: bool) -> float:
-    """Brightness of a wall through even fog, white before black airlight or black before white."""
+    """Brightness of a white wall through even fog of black airlight, or of a black wall through white airlight.
+
+    Args:
+        scene: its frame gives the scale.
+        visibility: of the fog, m.
+        metres: distance of the wall.
+        white_wall: which of the two walls.
+        reference: render with the float64 reference rather than the CPU rasterizer.
+    """
     fog = effect("fog", intensity=visibility)
     assert fog.haze is not None
     haze = replace(fog.haze, rgb=(0.0,) * 3 if white_wall else (1.0,) * 3, patchiness=0.0)
@@ -95,14 +107,14 @@ def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, r
         seen = render_reference(cameras, [wall], torch.full((3,), float(not white_wall)), moments=moment)
     else:
         seen = CpuRasterizer(wall).render(cameras, None, torch.full((3,), float(not white_wall)), moment)
-    # One Gaussian lets 1 - max_alpha through, which is no matter of the fog.
+    # One Gaussian is never quite opaque; the light behind it is subtracted, since it has nothing to do with the fog.
     share = seen.accumulation[0, 8, 8]
     through = seen.rgb[0, 8, 8].mean() - (1 - share) * moment.seen_behind.mean()
     return float(through / share)
 
 
 class _Air:
-    """A moment of nothing but air."""
+    """A moment whose only effect is the air's medium."""
 
     key = b"air"
 
@@ -125,7 +137,7 @@ class _Air:
 
 
 def _patchy(scene: Scene, quick: bool) -> Iterator[Record]:
-    """Drifting patches: what froxels sum up against a fine quadrature along each ray, as light that arrives."""
+    """Light through drifting patches of fog: the sum over froxels against a fine quadrature along each ray."""
     fog = effect("fog")
     field = HazeField.of(fog, scene.frame, domain_of(scene))
     camera = scene.cameras[0]
@@ -158,6 +170,7 @@ def _patchy(scene: Scene, quick: bool) -> Iterator[Record]:
 
 
 def _layers(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
+    """Shares of the demo's upward and downward faces that a snowfall hides, over time."""
     snow, metric = effect("snowfall"), to_metric(scene)
     exposure = Exposure.of(metric, surface, snow)
     layers = Coating.of(snow, exposure, metric.means)
@@ -182,7 +195,7 @@ def _layers(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
 
 
 def _first_second(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
-    """Rendered at second 0 of each effect with an onset, against the picture without any weather."""
+    """Pictures at second 0 of each effect with an onset against the picture without weather."""
     camera = scene.cameras[0].resized(160, 108)
     rasterizer = choose_rasterizer(scene.gaussians, "cpu")
     plain = rasterizer.render(camera).rgb
@@ -202,7 +215,7 @@ def _first_second(scene: Scene, surface: SurfaceMesh) -> Iterator[Record]:
 
 
 def _sun(scene: Scene) -> Record:
-    """On the surface that is fused from depth, as captures have it."""
+    """Direction of the sun found on the surface that is fused from depth, as in captures."""
     surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"), progress=False)
     metric = to_metric(scene)
     sun = sun_of(metric, Exposure.of(metric, surface, effect("snowfall")), surface)

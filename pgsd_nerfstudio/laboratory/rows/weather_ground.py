@@ -1,5 +1,5 @@
-"""Figures of weathers where they meet the scene: where snow, sand and rain come down, how long a drop's streak is, how a
-weather begins. Every row is measured on a simulation of the built-in effects as they are."""
+"""Figures of weather in a scene: where snow, sand and rain land, the length of a drop's streak, and the onset. Every row is
+measured on a simulation of a built-in effect."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 HOUSE = (3.0, 3.0, 2.5)  # m
 AROUND = Domain((-7.0, -7.0, -0.2), (7.0, 7.0, 5.0))
-BESIDE = 1.0  # m of ground before and behind the house
-DEPTH = 1e-3  # m from which a point counts as inside of a solid
+BESIDE = 1.0  # m of ground before and behind the house that count
+DEPTH = 1e-3  # m below a solid's faces at which a point counts as inside
 DISTANCE = 2.0  # m from the lens to the drop whose streak is measured
 LEAN = "; dense matter left out, compiling its kernels would take the time of all"
 
 
 def rows(quick: bool) -> Iterable[Record]:
-    """Where particles land and how they look on their way; quick: fewer of them, and without dense matter."""
+    """Landings, streaks and onsets; `quick` takes fewer particles and leaves out dense matter."""
     scene = demo_scene()
     if scene.mesh is None:
         raise ValueError("the demo scene must have its exact mesh, found none")
@@ -52,11 +52,11 @@ def rows(quick: bool) -> Iterable[Record]:
 
 
 def _snow(scene: Scene, surface: SurfaceMesh, quick: bool) -> Iterable[Record]:
-    """Where the flakes of a snowfall in the demo scene lie."""
+    """Rest positions of the flakes of a snowfall in the demo scene."""
     snow, frames = (replace(SNOWFALL, dense=None), 75) if quick else (SNOWFALL, 250)
     run = simulate_metric(surface, snow, Clock(frames=frames), domain_of(scene), progress=False)
-    lying, covers = run.rest_positions[run.collided], run.rest_covers[run.collided]
-    foot = lying - snow.surface.settle * roma.unitquat_to_rotmat(run.rest_quats[run.collided].roll(-1, 1))[:, :, 2]
+    resting, covers = run.rest_positions[run.collided], run.rest_covers[run.collided]
+    foot = resting - snow.surface.settle * roma.unitquat_to_rotmat(run.rest_quats[run.collided].roll(-1, 1))[:, :, 2]
     foot[:, 2] -= covers
     found = surface.closest(foot)
     on = (found.distance <= 0.005).float().mean()
@@ -68,8 +68,8 @@ def _snow(scene: Scene, surface: SurfaceMesh, quick: bool) -> Iterable[Record]:
     )  # fmt: skip
     yield from _inside_walls(run)
     stop = run.offsets[1:][run.collided]
-    touched, before = run.positions[stop - 1], run.positions[torch.maximum(stop - 2, run.offsets[:-1][run.collided])]
-    deeper = touched[:, 2] - foot[:, 2] - covers
+    contact, before = run.positions[stop - 1], run.positions[torch.maximum(stop - 2, run.offsets[:-1][run.collided])]
+    deeper = contact[:, 2] - foot[:, 2] - covers
     yield Record.judged(
         "snow: landed flakes laid more than 2 cm deeper than where they touched", float((deeper > 0.02).float().mean()),
         "of all", "<= 0.001",
@@ -86,7 +86,7 @@ def _snow(scene: Scene, surface: SurfaceMesh, quick: bool) -> Iterable[Record]:
 
 
 def _inside_walls(run: ParticleHistory) -> Iterable[Record]:
-    """What is inside of the demo's walls: of all that flies and rests, and of what slides along them."""
+    """Shares of positions and of sliders that are inside of the demo's walls."""
     owners = torch.repeat_interleave(torch.arange(len(run)), run.offsets.diff())
     on_way, at_rest = _in_walls(run.positions), _in_walls(run.rest_positions) & run.collided
     slid = (run.kinds & SLID) > 0
@@ -105,7 +105,7 @@ def _inside_walls(run: ParticleHistory) -> Iterable[Record]:
 
 
 def _in_walls(points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Which points in metres are inside of the demo's two brick walls, by the numbers that these are made from."""
+    """Which points (m) are inside of the demo's two brick walls, by the numbers that the walls are modelled with."""
     ends, thick = (-HALF - WALL_THICKNESS, HALF), (HALF, HALF + WALL_THICKNESS)
     x, y, z = points.T
     north = _between(x, *ends) & _between(y, *thick)
@@ -118,7 +118,7 @@ def _between(values: Float[Tensor, " n"], low: float, high: float) -> Bool[Tenso
 
 
 def _sand(quick: bool) -> Iterable[Record]:
-    """Windward against leeward of a house in a sandstorm, its walls square to the wind."""
+    """Sand that lands windward and leeward of a house whose walls are square to the wind."""
     storm, frames = (replace(SANDSTORM, dense=None), 75) if quick else (SANDSTORM, 250)
     surface = _house(math.radians(storm.wind.direction_degrees))
     run = simulate_metric(surface, storm, Clock(frames=frames), AROUND, progress=False)
@@ -146,7 +146,16 @@ def _off_house(beyond: np.ndarray) -> np.ndarray:
 def _ratio(
     name: str, windward: np.ndarray, leeward: np.ndarray, volume: np.ndarray, about: str, target: str | None = ">= 5"
 ) -> Record:
-    """Volumes that landed on both sides; where nothing did leeward, counts against a single grain."""
+    """Ratio of the volumes that landed windward and leeward; without leeward grains, the windward count.
+
+    Args:
+        name: of the row.
+        windward: [n] which grains landed windward.
+        leeward: [n] which grains landed leeward.
+        volume: [n] of each grain, in any unit.
+        about: source of the row.
+        target: comparison that judges the row; None: the row is not judged.
+    """
     counts = f"{int(windward.sum()):,} grains windward, {int(leeward.sum()):,} leeward; {about}"
     if leeward.any():
         value = float(volume[windward].sum() / volume[leeward].sum())
@@ -158,7 +167,7 @@ def _ratio(
 
 
 def _house(angle: float) -> SurfaceMesh:
-    """A ground of 16 m and a box on it, turned by `angle`; faces look outward."""
+    """A ground of 16 m and on it a box rotated by `angle` radians; its faces point outward."""
     corners = torch.tensor([[x, y, z] for z in (0.0, HOUSE[2]) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     corners[:, :2] *= torch.tensor(HOUSE[:2])
     corners[:, :2] = _turned(corners, -angle)[:, :2]
@@ -170,14 +179,14 @@ def _house(angle: float) -> SurfaceMesh:
 
 
 def _turned(points: Float[Tensor, "n 3"], angle: float) -> Float[Tensor, "n 3"]:
-    """In axes that are turned by `angle` about z."""
+    """Points in axes that are rotated by `angle` radians about z."""
     cos, sin = math.cos(angle), math.sin(angle)
     x, y, z = points.T
     return torch.stack([cos * x + sin * y, cos * y - sin * x, z], 1)
 
 
 def _water(scene: Scene, surface: SurfaceMesh, quick: bool) -> Record:
-    """Whether all the rain that meets the demo scene is found again; quick: its table and what stands on it."""
+    """Balance of the rain that lands in the demo scene; `quick` takes only its table and the objects on it."""
     domain, frames, most = domain_of(scene), 125, 10_000
     if quick:
         domain, frames, most = Domain((-1.5, -1.5, -0.3), (1.5, 1.5, 3.0)), 40, 800
@@ -197,14 +206,14 @@ def _water(scene: Scene, surface: SurfaceMesh, quick: bool) -> Record:
 
 
 def _within(surface: SurfaceMesh, domain: Domain) -> SurfaceMesh:
-    """The triangles that lie in a box as a whole."""
+    """The triangles that are entirely inside of a domain."""
     corners = surface.vertices[surface.triangles.long()]
     inside = (corners > torch.tensor(domain.lower)) & (corners < torch.tensor(domain.upper))
     return SurfaceMesh(surface.vertices, surface.triangles[inside.all(2).all(1)])
 
 
 def _streaks() -> Iterable[Record]:
-    """Length of the streaks of drops in still air, as the roll-out carries them and as the rasterizer draws one."""
+    """Lengths of the streaks of drops in still air: in the roll-out, and of one drop in the picture."""
     still = replace(RAINFALL, wind=Wind(speed=0.0, turbulence=0.0, flutter=0.0))
     domain = Domain((-1.0, -1.0, 0.0), (1.0, 1.0, 4.0))
     run = simulate_metric(SurfaceMesh.empty(), still, Clock(frames=8), domain, max_particles=300, progress=False)
@@ -231,7 +240,7 @@ def _streaks() -> Iterable[Record]:
 
 
 def _drawn_length(drop: Gaussians) -> float:
-    """Pixels over which the motion spreads a drop that is seen from the side."""
+    """Length in pixels of the streak of a drop that is seen from the side."""
     side = 160
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looking along +y, z up
@@ -247,7 +256,7 @@ def _drawn_length(drop: Gaussians) -> float:
 
 
 def _beginnings() -> Iterable[Record]:
-    """Frame 0 and the steady number of weathers that come within a second."""
+    """Particles of effects with an onset of 1 s: in frame 0, and in the steady state afterwards."""
     domain, clock = Domain((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0)), Clock(frames=50)
 
     def number(weather: Effect, timeline: Timeline) -> ParticleHistory:
