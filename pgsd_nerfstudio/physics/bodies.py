@@ -51,7 +51,11 @@ class Bodies:
         return len(self.ids)
 
     def select(self, which: ndarray) -> Bodies:
-        """The particles that a mask or an array of indices chooses."""
+        """The chosen particles.
+
+        Args:
+            which: mask or indices.
+        """
         return Bodies(*(getattr(self, f.name)[which] for f in fields(self)))
 
     @staticmethod
@@ -60,7 +64,11 @@ class Bodies:
         return Bodies(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Bodies)))
 
     def marked(self, kind: int) -> Bodies:
-        """The same particles with the bit `kind` (SPLASHED, SLID or DENSE) set."""
+        """The same particles with a bit of their kinds set.
+
+        Args:
+            kind: SPLASHED, SLID or DENSE.
+        """
         return replace(self, kinds=self.kinds | np.uint8(kind))
 
     @staticmethod
@@ -130,6 +138,11 @@ def without_prefix(prefix: str, arrays: Mapping[str, T]) -> dict[str, T]:
 
 
 def random_orientations(key: Sequence[int], count: int) -> Float[ndarray, "n 4"]:
-    """Random unit quaternions (wxyz), uniform over all orientations; `key` seeds them."""
+    """Random unit quaternions (wxyz), uniform over all orientations.
+
+    Args:
+        key: seed of the random numbers.
+        count: number of quaternions.
+    """
     quats = np.random.default_rng(key).normal(size=(count, 4))
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)

@@ -45,7 +45,12 @@ class Air:
     seed: int
 
     def draws(self, frame: int, purpose: int = 0x5704) -> np.random.Generator:
-        """Random numbers that depend on the seed, the frame and the purpose alone, not on how the run reached the frame."""
+        """Random numbers that depend on the seed, the frame and the purpose alone, not on how the run reached the frame.
+
+        Args:
+            frame: frame in which they are drawn.
+            purpose: any number that tells uses of random numbers in a frame apart.
+        """
         return np.random.default_rng([self.seed, frame, purpose])
 
     def settled(self, positions: ndarray, speeds: ndarray, time: float) -> Float[ndarray, "n 3"]:

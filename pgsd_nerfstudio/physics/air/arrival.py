@@ -112,5 +112,9 @@ class Arrival:
         return float((corners @ [1.0, -1.0, -1.0, 1.0]) / (2 * short * long))
 
     def is_over(self, seconds: float) -> bool:
-        """Whether no more particles enter after `seconds`."""
+        """Whether no more particles enter.
+
+        Args:
+            seconds: time since the start of the run.
+        """
         return seconds > self.timeline.ends + INSTANT

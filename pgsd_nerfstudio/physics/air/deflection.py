@@ -98,7 +98,11 @@ class Deflection:
         return velocity
 
     def shelter(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
-        """Share of the turbulence that is left, 0-1, and its gradient in 1/m, which is continuous, at points in metres."""
+        """Share of the turbulence that is left, 0-1, and its gradient in 1/m, which is continuous.
+
+        Args:
+            points: m.
+        """
         base, share = self._at(points)
         smooth, slope = share**2 * (3 - 2 * share), 6 * share * (1 - share) / self.lattice.cell
         weights, slopes = np.stack([1 - smooth, smooth]), np.stack([-slope, slope])

@@ -82,7 +82,11 @@ class Sizes:
         return np.interp(share * cumulative[-1], cumulative, self.diameters)
 
     def represents(self, diameters: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-        """Real particles that one simulated particle of each diameter (m) represents."""
+        """Real particles that one simulated particle of each diameter represents.
+
+        Args:
+            diameters: m.
+        """
         return 1.0 / np.interp(diameters, self.diameters, self.chances)
 
 

@@ -85,7 +85,11 @@ class Lattice(NamedTuple):
         return np.where((np.arange(self.shape[2]) == 0) & self.grounded, BOTTOM, 1.0)
 
     def face_centres(self, axis: int) -> Float[ndarray, "x y z 3"]:
-        """Middle of every face across an axis (0, 1 or 2), m."""
+        """Middle of every face across an axis, m.
+
+        Args:
+            axis: 0, 1 or 2.
+        """
         middle = [np.arange(n + (a == axis)) + 0.5 * (a != axis) for a, n in enumerate(self.shape)]
         return self.lower + self.cell * np.stack(np.meshgrid(*middle, indexing="ij"), -1)
 

@@ -104,14 +104,19 @@ class Sight:
         return float(self.needed_cells.mean()) if self.needed_cells.size else 1.0
 
     def needed(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Whether a particle at each point (m) is seen or may still come into view.
+        """Whether a particle at each point is seen or may still come into view.
 
-        Outside of the domain x and y are wrapped and z is clipped.
+        Args:
+            points: m; outside of the domain x and y are wrapped and z is clipped.
         """
         return self._look_up(self.needed_cells, points)
 
     def seen(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Whether a camera may see a particle at each point (m); points outside of the domain are treated as in `needed`."""
+        """Whether a camera may see a particle at each point.
+
+        Args:
+            points: m; outside of the domain x and y are wrapped and z is clipped.
+        """
         return self._look_up(self.seen_cells, points)
 
     def _look_up(self, cells: Bool[ndarray, "x y z"], points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:

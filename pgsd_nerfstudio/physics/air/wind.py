@@ -50,7 +50,11 @@ class Obstructed(Protocol):
         ...
 
     def shelter(self, points: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
-        """Share of the turbulence that is left, 0-1, and its gradient in 1/m, at points in metres."""
+        """Share of the turbulence that is left, 0-1, and its gradient in 1/m.
+
+        Args:
+            points: m.
+        """
         ...
 
     def nodes(self, wind: Float[ndarray, "2"], dtype: DTypeLike) -> tuple[ndarray, ndarray, ndarray]:
@@ -142,18 +146,26 @@ class WindField:
         return replace(self, deflection=None)
 
     def at_reference(self, time: float) -> Float[ndarray, "2"]:
-        """Mean wind with its gusts at the reference height, m/s."""
+        """Mean wind with its gusts at the reference height, m/s.
+
+        Args:
+            time: s.
+        """
         amplitude, hertz, phase = np.moveaxis(self.gusts, 2, 0)
         along, across = (amplitude * np.sin(2 * math.pi * (hertz * time + phase))).sum(1)
         crosswise = np.array([-self.mean[1], self.mean[0]])
         return self.mean * (1 + self.gustiness * along) + crosswise * (self.gustiness * across)
 
     def phases_at(self, time: float) -> Float[ndarray, " m"]:
-        """Phase of every mode at the origin, in turns, 0..1."""
+        """Phase of every mode at the origin, in turns, 0..1.
+
+        Args:
+            time: s.
+        """
         return (self.phases + (self.drifts - self.waves[:, :2] @ self.mean) * time) % 1.0
 
     def velocity(self, points: Float[ndarray, "n 3"], time: float) -> Float[ndarray, "n 3"]:
-        """Air velocity in m/s at points in metres; the plain form that checks the kernel of `airborne`.
+        """Air velocity in m/s. This is the plain form that checks the kernel of `airborne`.
 
         Args:
             points: m, z up.

@@ -65,7 +65,13 @@ class Cover:
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, config: CoverConfig | None = None) -> Cover:
-        """A cover of thickness 0 on all surfaces of a domain that face up."""
+        """A cover of thickness 0 on all surfaces that face up.
+
+        Args:
+            surface: the mesh, in metres.
+            domain: bounds the cover.
+            config: resolution and slopes; None: the defaults.
+        """
         config = config or CoverConfig()
         return Cover(Columns.of(surface, domain, config.cell, config.gap), config)
 
@@ -110,22 +116,38 @@ class Cover:
         return len(left) == 0
 
     def find(self, points: Float[ndarray, "n 3"]) -> Int[ndarray, " n"]:
-        """Level whose surface or cover each point (m) is in or near; -1 where there is none."""
+        """Level whose surface or cover each point is in or near; -1 where there is none.
+
+        Args:
+            points: m.
+        """
         return self.columns.find(points, self.heights, self.config.tolerance)
 
     def height(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Thickness of the cover in metres at points (m) on or near a surface, continuous within a sheet; 0 without a level."""
+        """Thickness of the cover in metres, continuous within a sheet; 0 without a level.
+
+        Args:
+            points: m, on or near a surface.
+        """
         return _read(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
 
     def above(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Height in metres of points (m) above the bare surface beneath them, not negative; 0 without a level."""
+        """Height in metres above the bare surface beneath each point, not negative; 0 without a level.
+
+        Args:
+            points: m.
+        """
         level, above = self.find(points), np.zeros(len(points))
         known = level >= 0
         above[known] = points[known, 2] - self.columns.base[level[known]]
         return above.clip(0.0)
 
     def normal(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Unit normals of the top of the cover at points (m), continuous within a sheet; straight up without a level."""
+        """Unit normals of the top of the cover, continuous within a sheet; straight up without a level.
+
+        Args:
+            points: m, on or near a surface.
+        """
         slopes = _slopes(self.find(points), np.ascontiguousarray(points, np.float64), self.heights, self.columns)
         normal = np.column_stack([-slopes, np.ones(len(slopes))])
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)

@@ -36,11 +36,19 @@ class Raised(Protocol):
     """A cover on the surface; `cover.Cover` has it."""
 
     def height(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Thickness along z in metres at points (m) on the surface."""
+        """Thickness along z in metres.
+
+        Args:
+            points: m, on the surface.
+        """
         ...
 
     def normal(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-        """Unit normals of the top of the cover at points (m) on the surface."""
+        """Unit normals of the top of the cover.
+
+        Args:
+            points: m, on the surface.
+        """
         ...
 
     @property

@@ -72,7 +72,12 @@ class WetnessGrid:
 
     @staticmethod
     def of(surface: SurfaceMesh, domain: Domain, wetting: Wetting | None = None) -> WetnessGrid:
-        """The cells around a surface, in metres, within a domain.
+        """The cells around a surface.
+
+        Args:
+            surface: the mesh, in metres.
+            domain: bounds the cells.
+            wetting: cell size and laws of spreading and drying; None: the defaults.
 
         Raises:
             ValueError: there would be more than 20 million cells.
@@ -120,14 +125,18 @@ class WetnessGrid:
         return float(np.asarray(mass, np.float64)[~caught].sum())
 
     def step(self, seconds: float) -> None:
-        """Let water spread and dry for `seconds`; the step is exact for any length."""
+        """Let water spread and dry; the step is exact for any length of time."""
         self._spread(seconds)
         before = self.held
         self.water *= math.exp(-seconds / self.wetting.drying_seconds)
         self.evaporated += before - self.held
 
     def sample(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
-        """Water in kg/m^3 at points (m), interpolated between the existing lattice points; 0 where there are none."""
+        """Water in kg/m^3, interpolated between the existing lattice points; 0 where there are none.
+
+        Args:
+            points: m.
+        """
         cells, weights = self._corners(points)
         found = (weights * self.water[cells]).sum(1) if len(self) else np.zeros(len(points))
         return found / weights.sum(1).clip(1e-12) / self.wetting.cell**3

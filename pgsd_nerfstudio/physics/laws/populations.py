@@ -77,10 +77,20 @@ def cross_section(diameter: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
 
 
 def integral(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> float:
-    """Trapezoidal integral of `density` over the abscissas `at`."""
+    """Trapezoidal integral.
+
+    Args:
+        density: values.
+        at: ascending abscissas of the values.
+    """
     return float(cumulative(density, at)[-1])
 
 
 def cumulative(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> Float[ndarray, " d"]:
-    """Trapezoidal integral of `density` up to each of the abscissas `at`."""
+    """Trapezoidal integral up to each abscissa.
+
+    Args:
+        density: values.
+        at: ascending abscissas of the values.
+    """
     return cumulative_trapezoid(density, at, initial=0.0)

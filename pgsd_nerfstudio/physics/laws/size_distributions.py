@@ -40,7 +40,11 @@ class Distribution(Protocol):
         ...
 
     def density(self, diameter: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-        """N(D) in 1/m^4 at diameters in metres; 0 outside of the two bounds."""
+        """N(D) in 1/m^4; 0 outside of the two bounds.
+
+        Args:
+            diameter: m.
+        """
         ...
 
     def moment(self, order: float) -> float:

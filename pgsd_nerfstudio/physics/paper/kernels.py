@@ -24,13 +24,23 @@ FRICTION_DEGREES = 45.0  # of sand
 
 @ti.func
 def lowest_node(x, inv_dx):
-    """Lowest of the 3 x 3 x 3 nodes around a position; node (i, j, k) is at (i, j, k) * dx."""
+    """Lowest of the 3 x 3 x 3 nodes around a position; node (i, j, k) is at (i, j, k) * dx.
+
+    Args:
+        x: [3] position, boxes.
+        inv_dx: 1 / dx, nodes per box.
+    """
     return ti.cast(ti.floor(x * inv_dx - 0.5), ti.i32)
 
 
 @ti.func
 def row_of(node, cells):
-    """Row of a node in the grid, which has `cells` nodes per axis."""
+    """Row of a node in the grid.
+
+    Args:
+        node: [3] indices of the node.
+        cells: nodes per axis.
+    """
     return (node[0] * cells + node[1]) * cells + node[2]
 
 
@@ -183,7 +193,15 @@ def scatter(
 
 @ti.kernel
 def move(grid: Array2, dt: float, gravity_x: float, gravity_y: float, gravity_z: float):
-    """Turn momentum into velocity and add gravity (boxes/s^2) over `dt` seconds at every node."""
+    """Turn momentum into velocity and add gravity at every node.
+
+    Args:
+        grid: [nodes, 4]; momentum becomes velocity.
+        dt: s.
+        gravity_x: boxes/s^2.
+        gravity_y: boxes/s^2.
+        gravity_z: boxes/s^2.
+    """
     pull = dt * ti.Vector([gravity_x, gravity_y, gravity_z])
     for node in range(grid.shape[0]):
         if grid[node, 0] > 0.0:

@@ -53,7 +53,13 @@ class RunRecord:
         return np.arange(self.born - count, self.born, dtype=np.int32)
 
     def at(self, frame: int, ids: Int[ndarray, " n"], positions: Float[ndarray, "n 3"]) -> None:
-        """Record positions (m) of active particles in a frame, including those that stop in it."""
+        """Record positions of active particles in a frame, including those that stop in it.
+
+        Args:
+            frame: the frame.
+            ids: the particles.
+            positions: m.
+        """
         self._rows.append((ids, frame, positions.astype(np.float32)))
 
     def left(self, frame: int, ids: Int[ndarray, " n"]) -> None:

@@ -178,7 +178,11 @@ class PaperSolver:
         return done
 
     def substep(self, dt: float) -> None:
-        """Advance by `dt` seconds without a check of stability."""
+        """Advance without a check of stability.
+
+        Args:
+            dt: s.
+        """
         config, count = self.config, len(self)
         mu, lam = config.moduli
         kind, mass = _KINDS[config.material], DENSITY * config.particle_volume

@@ -95,14 +95,23 @@ class ParticleHistory:
         return (self.collided & (self.ends <= frame)).nonzero()[:, 0]
 
     def positions_at(self, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Positions in metres of particles that are active at `frame`."""
+        """Positions of particles in metres.
+
+        Args:
+            frame: the frame.
+            ids: particles that are active in that frame.
+        """
         return self.positions[self._rows(frame, ids)]
 
     def displacement_at(self, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Displacements x(frame) - x(frame - 1) in metres of particles that are active at `frame`.
+        """Displacements x(frame) - x(frame - 1) of particles in metres.
 
         In the frame of birth the displacement is that of the next frame, x(birth + 1) - x(birth), as if the particle had
         entered with that velocity. It is zero for a particle that is active in one frame only.
+
+        Args:
+            frame: the frame.
+            ids: particles that are active in that frame.
         """
         rows = self._rows(frame, ids)
         born = self.births[ids] == frame
@@ -111,7 +120,12 @@ class ParticleHistory:
         return self.positions[here] - self.positions[torch.where(born, rows, rows - 1)]
 
     def window(self, start: int, stop: int) -> Window:
-        """Dense trajectories of the particles that are active in any of the frames start .. stop (exclusive)."""
+        """Dense trajectories of the particles that are active in any frame of a window.
+
+        Args:
+            start: first frame.
+            stop: exclusive end of the frames.
+        """
         ids = ((self.births < stop) & (start < self.ends)).nonzero()[:, 0]
         at = torch.arange(start, stop, device=self.device)
         born, ended = self.births[ids].long()[:, None], self.ends[ids].long()[:, None]

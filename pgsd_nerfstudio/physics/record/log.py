@@ -15,6 +15,13 @@ class Log:
     """Rows, births and ends in the frames of one chunk."""
 
     def __init__(self, start: int, frames: int, born: int) -> None:
+        """Start an empty log.
+
+        Args:
+            start: first frame of the chunk.
+            frames: number of frames.
+            born: number of particles before the chunk.
+        """
         self.start, self.frames = start, frames
         self.first = self.born = born
         self._rows: list[tuple[ndarray, int, ndarray]] = []
