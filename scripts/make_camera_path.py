@@ -12,8 +12,8 @@ from pathlib import Path
 
 import tyro
 
-from pgsd_nerfstudio.cli.preview import open_scene
-from pgsd_nerfstudio.scene.camera_path import choose_views, fly
+from pgsd_nerfstudio.scene.camera_path import slow_path
+from pgsd_nerfstudio.scene.loading import load_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,10 +39,9 @@ class CameraPath:
 
     def write(self) -> None:
         """Write the file and print its name."""
-        scene = open_scene(self.load_scene, self.data, None)
+        scene = load_scene(self.load_scene, self.data)
         frames = round(self.seconds * self.fps)
-        first, last = self.views or choose_views(scene.cameras, scene.frame)
-        cameras = fly(scene.cameras, first, last, start=0, frames=frames, fps=self.fps).resized(self.width, self.height)
+        cameras = slow_path(scene, frames=frames, fps=self.fps, views=self.views).resized(self.width, self.height)
         keys = [
             {
                 "camera_to_world": pose.flatten().tolist(),

@@ -21,7 +21,7 @@ import tyro
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from pgsd_nerfstudio.cli.video import to_bytes
+from pgsd_nerfstudio.weather.video import to_bytes
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.effects.effect import EFFECTS
 from pgsd_nerfstudio.scene.camera_path import choose_views
@@ -93,7 +93,7 @@ class Gallery:
             rows.append([self._picture(model, camera, untrained, share) for share in TIMES])
             if learned:
                 rows.append([self._picture(model, camera, model.rollout, share) for share in TIMES])
-        return self._joined(rows, model.config.options.seconds, learned)
+        return self._joined(rows, model.config.options.simulation.seconds, learned)
 
     def _picture(self, model, camera: Cameras, rollout: Rollout, share: float) -> np.ndarray:  # type: ignore[no-untyped-def]
         frame = model.frame_at(share)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +46,25 @@ def _pose(index: int) -> list[list[float]]:
 def tiny_config(scene: Path, prior: Path, outputs: Path, **flags):
     """What `ns-train pgsd-weather` would be configured with: one second of weather, 300 particles, clips of 5 frames."""
     from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
+    from pgsd_nerfstudio.plugin.options import RunOptions
 
     small = {"seconds": 0.8, "max_particles": 300, "steps": 3, "clip_frames": 5, "refresh_every": 2, "intensity": 3.0}
-    flags = {**small, "data": scene.parent, "output_dir": outputs, "timestamp": "now", "prior": str(prior), **flags}
-    return WeatherTrainerConfig(load_scene=scene, **flags)
+    flags = {**small, "load_scene": scene, "data": scene.parent, "prior": str(prior), **flags}
+    own = {f.name for f in fields(WeatherTrainerConfig) if f.name not in ("data", "prompt")}
+    given = {name: flags.pop(name) for name in list(flags) if name in own}
+    return WeatherTrainerConfig(run=grouped(RunOptions(), flags), **{"output_dir": outputs, "timestamp": "now", **given})
+
+
+def grouped(options, flags: dict):
+    """Options with the named ones in their groups, as the flags of a command have them."""
+    changes = {f.name: flags[f.name] for f in fields(options) if f.name in flags and not is_dataclass(getattr(options, f.name))}
+    known = set(changes)
+    for group in (f.name for f in fields(options) if is_dataclass(getattr(options, f.name))):
+        own = {f.name for f in fields(getattr(options, group))}
+        known |= own
+        changes[group] = replace(getattr(options, group), **{name: flags[name] for name in own & set(flags)})
+    assert set(flags) <= known, f"no such options: {set(flags) - known}"
+    return replace(options, **changes)
 
 
 def train(config) -> Path:

@@ -62,7 +62,7 @@ def test_the_same_preview_twice_is_the_same_picture(yard, tmp_path):
         ({"start": -1}, "--start must not be negative, got -1 s"),
         ({"intensity": -2}, "intensity must lie in"),
         ({"max-particles": 0}, "--max-particles must be positive, got 0"),
-        ({"views": (0, 8)}, "--views must lie in 0-7"),
+        ({"views": (0, 8)}, "views must lie in 0-7"),
         ({"metres-per-unit": -1}, "metres per scene unit must be a positive number"),
         ({"output": "/proc/none/v.mp4"}, "/proc/none/v.mp4 cannot be written (No such file or directory); choose another"),
     ],

@@ -10,8 +10,9 @@ import yaml
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
 
-from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio, open_scene, run_cameras, to_nerfstudio
+from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio, run_cameras, to_nerfstudio
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import SceneError
 
 
@@ -58,7 +59,7 @@ def test_a_panorama_is_refused_in_a_sentence():
 
 
 def test_the_cameras_of_a_run_look_at_its_splat(splatfacto_run: Path, garden_ply: Path, garden_data: Path):
-    scene, bare = open_scene(splatfacto_run), open_scene(garden_ply, garden_data)
+    scene, bare = load_scene(splatfacto_run), load_scene(garden_ply, garden_data)
     photographs = {path.name: i for i, path in enumerate(bare.images)}
     same = torch.tensor([photographs[path.name] for path in scene.images])
     # In their own camera's axes both splats are the same, up to the run's scale.
@@ -76,7 +77,7 @@ def test_the_cameras_of_a_run_look_at_its_splat(splatfacto_run: Path, garden_ply
 
 def test_after_a_checkpoint_was_read_nerfstudios_own_can_be_loaded_still(splatfacto_run: Path, tmp_path: Path):
     torch.save({"lr": np.float64(0.25)}, tmp_path / "step.ckpt")
-    open_scene(splatfacto_run)
+    load_scene(splatfacto_run)
     assert torch.load(tmp_path / "step.ckpt")["lr"] == 0.25
 
 

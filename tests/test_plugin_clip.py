@@ -11,12 +11,12 @@ from pgsd_nerfstudio.effects import effect, initial_look
 from pgsd_nerfstudio.physics.clock import Clock, Domain
 from pgsd_nerfstudio.physics.metric import simulate_metric
 from pgsd_nerfstudio.plugin.clip import render_clip, seen_by, surrogate
-from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.plugin.run_cameras import open_scene
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.response.prepare import answer_of
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 START, FRAMES = 14, 3
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
@@ -53,15 +53,15 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
 
 
-def rolled(world: SimpleNamespace, visible=None) -> list:
+def weather(world: SimpleNamespace, visible=None) -> list:
     clip = world.rollout.window(START, FRAMES, visible=visible)
-    return [world.prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in clip]
+    return [world.prepared.scene.frame.gaussians_to_scene(instant.gaussians) for instant in clip]
 
 
 def test_frame_by_frame_gives_the_gradient_of_the_whole_graph(world: SimpleNamespace):
-    picture = world.prepared.rasterizer.render(world.cameras, rolled(world), BACKGROUND, world.moments).rgb.permute(0, 3, 1, 2)
+    picture = world.prepared.rasterizer.render(world.cameras, weather(world), BACKGROUND, world.moments).rgb.permute(0, 3, 1, 2)
     whole = torch.autograd.grad((picture * world.gradient).sum(), world.learned, allow_unused=True)
-    total, norms = surrogate(world.prepared, world.cameras, rolled(world), BACKGROUND, world.moments, world.gradient)
+    total, norms = surrogate(world.prepared, world.cameras, weather(world), BACKGROUND, world.moments, world.gradient)
     parts = torch.autograd.grad(total, world.learned, allow_unused=True)
     assert sum(g is not None and bool(g.any()) for g in whole) > 10
     for a, b in zip(whole, parts, strict=True):
@@ -73,7 +73,7 @@ def test_frame_by_frame_gives_the_gradient_of_the_whole_graph(world: SimpleNames
 
 def test_the_air_of_a_moment_dims_the_gradient_of_what_moves_in_it(world: SimpleNamespace):
     through, clear = (
-        surrogate(world.prepared, world.cameras, rolled(world), BACKGROUND, moments, world.gradient)[1]["colors"]
+        surrogate(world.prepared, world.cameras, weather(world), BACKGROUND, moments, world.gradient)[1]["colors"]
         for moments in (world.moments, [None] * FRAMES)
     )
     assert all(moment is not None and moment.medium is not None for moment in world.moments)
@@ -83,12 +83,12 @@ def test_the_air_of_a_moment_dims_the_gradient_of_what_moves_in_it(world: Simple
 def test_particles_out_of_sight_change_nothing(world: SimpleNamespace):
     seen = seen_by(world.prepared, world.cameras, world.history, START)
     assert 0 < int(seen.sum()) < len(seen)
-    every = render_clip(world.prepared, world.cameras, rolled(world), BACKGROUND, world.moments)
-    some = render_clip(world.prepared, world.cameras, rolled(world, seen), BACKGROUND, world.moments)
+    every = render_clip(world.prepared, world.cameras, weather(world), BACKGROUND, world.moments)
+    some = render_clip(world.prepared, world.cameras, weather(world, seen), BACKGROUND, world.moments)
     assert float((every - some).abs().max()) < 0.02 and float((every - some).square().mean()) < 1e-6
 
 
 def test_a_clip_without_particles_has_a_gradient_of_nothing(world: SimpleNamespace):
-    nothing = [one.select(torch.zeros(0, dtype=torch.long)) for one in rolled(world)]
+    nothing = [one.select(torch.zeros(0, dtype=torch.long)) for one in weather(world)]
     total, norms = surrogate(world.prepared, world.cameras, nothing, BACKGROUND, world.moments, world.gradient)
     assert float(total) == 0 and not any(norms.values())

@@ -57,10 +57,10 @@ def test_interpolate_shows_weather_that_gathers(run: Path):
 def test_a_camera_path_shows_its_times(run: Path):
     import yaml
 
-    from pgsd_nerfstudio.plugin.run_cameras import open_scene
+    from pgsd_nerfstudio.scene.loading import load_scene
 
     options = yaml.load((run / CONFIG).read_text(), Loader=yaml.Loader).pipeline.options
-    scene = open_scene(options.load_scene)
+    scene = load_scene(options.scene.load_scene)
     matrix = scene.cameras.opengl()[0].flatten().tolist()
     keyframes = [{"camera_to_world": matrix, "fov": 45, "aspect": 1.5, "render_time": time} for time in (0.0, 0.5, 1.0)]
     path = {"render_width": 192, "render_height": 128, "seconds": 0.12, "camera_path": keyframes}

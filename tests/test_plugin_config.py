@@ -10,16 +10,17 @@ import pytest
 import torch
 import tyro
 import yaml
-from plugin_scene import tiny_config, write_scene
+from plugin_scene import grouped, tiny_config, write_scene
 from test_effects_language_model import GOOD, keys, needs_library, serving  # noqa: F401
 
 from pgsd_nerfstudio.effects.application import applied
-from pgsd_nerfstudio.effects.knobs import Knobs
+from pgsd_nerfstudio.effects.options import EffectOptions
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig, pgsd_weather
 from pgsd_nerfstudio.plugin.distiller import Distiller
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.options import RunOptions
+from pgsd_nerfstudio.weather.options import SceneOptions
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def parse(*arguments: object) -> WeatherTrainerConfig:
 def test_flags_reach_pipeline_data_manager_and_model(scene: Path):
     config = parse("--load-scene", scene, "--data", scene.parent, "--intensity", 2.5, "--steps", 7, "--machine.seed", 5)
     for part in (config.pipeline, config.pipeline.datamanager, config.pipeline.model):
-        assert (part.options.load_scene, part.options.intensity, part.options.training_seed) == (scene, 2.5, 5)
+        assert (part.options.scene.load_scene, part.options.weather.intensity, part.options.training_seed) == (scene, 2.5, 5)
     assert config.max_num_iterations == config.optimizers["look"]["scheduler"].max_steps == 7
     assert config.experiment_name == "floor"
 
@@ -46,11 +47,11 @@ def test_flags_reach_pipeline_data_manager_and_model(scene: Path):
 def test_paths_are_saved_as_absolute_ones(scene: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(scene.parent)
     config = parse("--load-scene", "floor.ply", "--data", ".")
-    assert config.pipeline.options.load_scene == scene and config.pipeline.options.data == scene.parent
+    assert config.pipeline.options.scene == SceneOptions(load_scene=scene, data=scene.parent)
 
 
 def test_the_demo_needs_no_path():
-    assert parse("--load-scene", "demo").pipeline.options.load_scene == Path("demo")
+    assert parse("--load-scene", "demo").pipeline.options.scene.load_scene == Path("demo")
 
 
 def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture):
@@ -58,7 +59,7 @@ def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture
         parse("--help")
     shown = capsys.readouterr().out
     assert left.value.code == 0
-    knobs = [f"--{knob.name.replace('_', '-')}" for knob in fields(Knobs)]
+    knobs = [f"--{knob.name.replace('_', '-')}" for knob in fields(EffectOptions)]
     for flag in ("--load-scene", "--data", "--prior", "--steps", "--seconds", "--metres-per-unit", *knobs):
         assert len(re.findall(rf"^[│ ] {flag} ", shown, re.MULTILINE)) == 1, flag
     assert shown.index("--load-scene") < shown.index("--effect") < shown.index("--prior")
@@ -107,7 +108,7 @@ def test_a_saved_config_comes_back_and_knows_where_its_run_lies(scene: Path, tmp
 def test_the_config_of_another_version_is_refused_in_a_sentence(scene: Path, tmp_path: Path, version: str):
     config = tiny_config(scene, Path("prior"), tmp_path / "outputs")
     config.save_config()
-    text = (config.get_base_dir() / "config.yml").read_text().replace(f"version: {config.version}", version)
+    text = (config.get_base_dir() / "config.yml").read_text().replace(f"version: {config.run.version}", version)
     with pytest.raises(RunError, match=r"written by pgsd_nerfstudio .* installed is .*train the run again"):
         yaml.load(text, Loader=yaml.Loader)
 
@@ -125,13 +126,13 @@ def test_words_are_read_once_and_the_saved_config_says_what_they_mean(
     config.save_config()
     loaded = yaml.load((config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader)
     options = loaded.pipeline.options
-    assert options == config.pipeline.options == loaded.options()
+    assert options == config.pipeline.options == loaded.run
     assert options.chosen_effect() == applied(read("heavy purple blorp rain").request)
     # What is kept is what counts, even if words should be read otherwise one day; of other words it says nothing.
     options.understood["request"]["size"] = 3.0
     assert options.chosen_effect() == applied(replace(read("heavy purple blorp rain").request, size=3.0))
-    assert replace(options, weather="thin fog").chosen_effect() == applied(read("thin fog").request)
-    assert replace(options, weather=None).chosen_effect() == WeatherOptions(load_scene=scene).chosen_effect()
+    assert grouped(options, {"weather": "thin fog"}).chosen_effect() == applied(read("thin fog").request)
+    assert grouped(options, {"weather": None}).chosen_effect() == RunOptions().chosen_effect()
 
 
 @needs_library
@@ -145,7 +146,7 @@ def test_a_language_model_is_asked_once_for_a_run_and_never_when_it_is_opened(
         config.set_timestamp()
         config.save_config()
         assert len(server.asked) == 1
-    assert [path.name[:5] for path in (tmp_path / "cache/requests").iterdir()] == ["request-"]
+    assert [path.name[:8] for path in (tmp_path / "cache/requests").iterdir()] == ["request-"]
     monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "elsewhere"))
     text = (config.get_base_dir() / "config.yml").read_text()
     options = yaml.load(text, Loader=yaml.Loader).pipeline.options
@@ -153,15 +154,16 @@ def test_a_language_model_is_asked_once_for_a_run_and_never_when_it_is_opened(
     assert options.remarks()[0].startswith("openai:test-model was asked what 'lilac wonders' means: snowfall")
 
 
+@pytest.mark.mistyped
 def test_the_video_prior_is_told_what_the_words_say_unless_there_is_a_prompt(scene: Path):
     class Deaf:
         def encode_prompt(self, texts: list[str]) -> torch.Tensor:
             return torch.zeros(len(texts), 1, 1)
 
-    words = parse("--load-scene", scene, "--data", scene.parent, "--weather", "purple snow").options()
-    assert Distiller.listening(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]
-    told = replace(words, prompt="A purple day")
-    assert Distiller.listening(Deaf(), told, "a yard").wanted == "A purple day"  # type: ignore[arg-type]
+    words = parse("--load-scene", scene, "--data", scene.parent, "--weather", "purple snow").run
+    assert Distiller.of(Deaf(), words, "a yard").wanted.startswith("Purple snow falling in a yard, accumulating")  # type: ignore[arg-type]
+    told = grouped(words, {"prompt": "A purple day"})
+    assert Distiller.of(Deaf(), told, "a yard").wanted == "A purple day"  # type: ignore[arg-type]
 
 
 # The command that makes a run again.
@@ -180,27 +182,31 @@ def test_the_video_prior_is_told_what_the_words_say_unless_there_is_a_prompt(sce
 )
 def test_the_command_of_a_run_makes_the_same_weather_again(scene: Path, flags: list[str]):
     config = parse("--load-scene", scene, "--data", scene.parent, *flags)
-    program, method, *words = shlex.split(config.options().command())
+    program, method, *words = shlex.split(config.run.command())
     assert (program, method) == ("ns-train", "pgsd-weather")
-    assert parse(*words).options() == config.options()
+    assert parse(*words).run == config.run
 
 
 def test_the_command_names_a_language_model(scene: Path):
-    options = WeatherOptions(load_scene=scene, weather="lilac wonders", llm="openai:x", llm_url="http://127.0.0.1:1/v1")
+    options = grouped(
+        RunOptions(),
+        {"load_scene": scene, "weather": "lilac wonders", "llm": "openai:x", "llm_url": "http://127.0.0.1:1/v1"},
+    )
     assert "--weather 'lilac wonders' --llm openai:x --llm-url http://127.0.0.1:1/v1" in options.command()
 
 
 def test_a_config_from_before_a_flag_was_added_has_its_default(scene: Path, tmp_path: Path):
     config = tiny_config(scene, Path("prior"), tmp_path / "outputs")
     config.save_config()
-    new = {knob.name for knob in fields(Knobs)} - {"effect", "intensity", "exposure"} | {"understood"}
+    new = {knob.name for knob in fields(EffectOptions)} - {"effect", "intensity", "exposure"}
     text = (config.get_base_dir() / "config.yml").read_text()
-    lines = [line for line in text.splitlines() if line.strip().partition(":")[0] not in new]
-    assert len(text.splitlines()) - len(lines) == 2 * len(new)  # of the trainer and of the options that the three others share
+    # Names of options stand within their group, deeper than the names of groups.
+    lines = [line for line in text.splitlines() if not (line.startswith(8 * " ") and line.strip().partition(":")[0] in new)]
+    assert len(text.splitlines()) - len(lines) == len(new)  # trainer, pipeline, data manager and model share one record
     loaded = yaml.load("\n".join(lines), Loader=yaml.Loader)
-    assert loaded.options() == loaded.pipeline.options == config.pipeline.options
+    assert loaded.run == loaded.pipeline.options == config.pipeline.options
     assert loaded.pipeline.options.chosen_effect() == config.pipeline.options.chosen_effect()
-    assert replace(loaded.pipeline.options, size=2.0).size == 2.0
+    assert grouped(loaded.pipeline.options, {"size": 2.0}).weather.size == 2.0
 
 
 def test_the_bundled_prior_teaches_snow_only_unless_it_is_told_to_try(scene):
@@ -215,4 +221,5 @@ def test_the_bundled_prior_teaches_snow_only_unless_it_is_told_to_try(scene):
         return all(rates)
 
     assert [learns(each) for each in (snow, rain, purple, tried, other)] == [True, False, True, True, True]
-    assert [each.max_num_iterations for each in (snow, rain, tried)] == [snow.training_steps, 1, 4] and snow.training_steps > 1
+    assert [each.max_num_iterations for each in (snow, rain, tried)] == [snow.run.training_steps, 1, 4]
+    assert snow.run.training_steps > 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from plugin_scene import HEIGHT, VIEWS, WIDTH, tiny_config, train, write_scene
+from plugin_scene import HEIGHT, VIEWS, WIDTH, grouped, tiny_config, train, write_scene
 from wan_tiny import tiny_wan
 
 from pgsd_nerfstudio.dynamics import FieldConfig, RegularizationWeights
@@ -40,7 +40,7 @@ def run(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         raise AssertionError("only training may do this")
 
     simulation = importlib.import_module("pgsd_nerfstudio.physics.motion_prior")
-    monkeypatch.setattr(simulation, "simulate", forbidden)
+    monkeypatch.setattr(simulation, "simulate_metric", forbidden)
     monkeypatch.setattr(simulation, "motion_prior", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.response.exposure.Exposure.of", forbidden)
     monkeypatch.setattr("pgsd_nerfstudio.guidance.video_prior.VideoPrior.load", forbidden)
@@ -69,8 +69,9 @@ def test_training_leaves_a_config_a_checkpoint_and_the_motion_prior(trained: Pat
         "nerfstudio_models/step-000000002.ckpt",
     } <= left
     config = yaml.load(trained.read_text(), Loader=yaml.Loader)
-    assert (config.clip_frames, config.clip_height, config.clip_width) == (5, 32, 48), "settled defaults are saved"
-    assert config.pipeline.options.clip_width == 48
+    clips = config.run.clips
+    assert (clips.clip_frames, clips.clip_height, clips.clip_width) == (5, 32, 48), "settled defaults are saved"
+    assert config.pipeline.options.clips.clip_width == 48
 
 
 def test_only_what_is_learned_lies_in_the_checkpoint(run: Path):
@@ -140,7 +141,7 @@ def test_training_clips_show_the_answer_unless_the_bundled_prior_looks_at_them(p
         train(tiny_config(write_scene(tmp_path), prior, tmp_path / str(asked), steps=1, surfaces_in_clips=asked))
     assert [all(one) for one in seen] == [True, False] and not any(seen[1])
     config = tiny_config(write_scene(tmp_path), Path("bundled"), tmp_path / "o")
-    assert not config.answering_clips
+    assert not config.run.answering_clips
 
 
 def test_depth_and_accumulation_come_along(run: Path):
@@ -190,7 +191,7 @@ def test_a_run_without_its_answer_names_the_command_too(run: Path, tmp_path: Pat
 def test_a_scene_that_changed_since_is_refused(run: Path, tmp_path: Path):
     copy = copied(run, tmp_path)
     config = yaml.load(copy.read_text(), Loader=yaml.Loader)
-    config.pipeline.options.load_scene = write_scene(tmp_path, table=0.7)
+    config.pipeline.options = grouped(config.pipeline.options, {"load_scene": write_scene(tmp_path, table=0.7)})
     copy.write_text(yaml.dump(config))
     with pytest.raises(RunError, match="is not the scene this run was trained on"):
         opened(copy)
@@ -213,13 +214,13 @@ def test_a_checkpoint_that_lacks_a_tensor_is_refused(run: Path, tmp_path: Path):
 
 
 def test_training_goes_on_from_a_checkpoint(trained: Path, prior: Path, tmp_path: Path):
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     more = train(tiny_config(scene, prior, tmp_path, steps=1, load_dir=trained.parent / "nerfstudio_models"))
     assert [path.name for path in (more.parent / "nerfstudio_models").iterdir()] == ["step-000000003.ckpt"]
 
 
 def test_the_same_seed_learns_the_same(trained: Path, prior: Path, tmp_path: Path):
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     again = train(tiny_config(scene, prior, tmp_path))
     ours, theirs = (torch.load(next(p.parent.glob("nerfstudio_models/*.ckpt")))["pipeline"] for p in (trained, again))
     for key, value in ours.items():
@@ -233,7 +234,7 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_bits(trained: Path, prior
     start far from frame 0, where all states are the same."""
     from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
 
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     whole = train(tiny_config(scene, prior, tmp_path / "whole", steps=6, seconds=2.4))
     step_before = WeatherPipeline.get_train_loss_dict
 
@@ -270,7 +271,7 @@ def test_a_run_that_was_broken_off_goes_on_to_the_same_bits(trained: Path, prior
     ids=["nfsd", "bridge", "w/o PG", "w/o App", "paper's code", "w/o Motion", "w/o CH", "w/o L_app"],
 )
 def test_every_ablation_of_the_paper_trains_and_opens(trained: Path, prior: Path, tmp_path: Path, flags):
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     pipeline = opened(train(tiny_config(scene, prior, tmp_path, steps=2, **flags)))
     model = pipeline.model
     assert any(bool(p.any()) for name, p in model.field.named_parameters() if "heads" in name), "something was learned"
@@ -295,7 +296,7 @@ def test_an_interrupted_training_keeps_what_it_has_learned(
         return step_before(self, step)
 
     monkeypatch.setattr(WeatherPipeline, "get_train_loss_dict", interrupted)
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     config = train(tiny_config(scene, prior, tmp_path))
     assert "--load-dir" in capsys.readouterr().out
     assert [path.name for path in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000001.ckpt"]
@@ -325,7 +326,7 @@ def test_a_prior_that_predicts_nan_skips_its_step_and_is_given_up_after_three_wi
         return whole(self, noisy, timestep, text) * (float("nan") if len(calls) == 1 or forever else 1.0)
 
     monkeypatch.setattr(CogVideoXPrior, "predict_v", broken_at_first)
-    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).load_scene
+    scene = yaml.load(trained.read_text(), Loader=yaml.Loader).run.scene.load_scene
     forever = False
     opened(train(tiny_config(scene, prior, tmp_path / "once")))
     forever = True

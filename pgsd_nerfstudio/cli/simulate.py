@@ -10,50 +10,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pgsd_nerfstudio.cli.preview import Simulated, effect_told, open_scene, say
-from pgsd_nerfstudio.cli.refusal import Refusal, refusing
-from pgsd_nerfstudio.effects.knobs import Knobs
+from pgsd_nerfstudio.cli.asked import WeatherCommand
+from pgsd_nerfstudio.cli.refusal import refusing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(kw_only=True)
-class Simulate(Knobs, Simulated):
-    """Simulate a weather in a scene, physics only. Interrupted, it goes on where it was; ns-train finds the result."""
+@dataclass(frozen=True, kw_only=True)
+class Simulate(WeatherCommand):
+    """Simulate a weather in a scene, physics only. Interrupted, it goes on where it was; the other commands find the result."""
 
     output: Path = Path("simulation")
     """Folder for report.json and report.png."""
 
     def run(self) -> int:
-        from pgsd_nerfstudio.physics import Clock, motion_prior
         from pgsd_nerfstudio.physics.record.report import report
-        from pgsd_nerfstudio.rendering.choice import choose_rasterizer
         from pgsd_nerfstudio.surface.mesh import surface_of
+        from pgsd_nerfstudio.weather.making import motion_of
+        from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
 
-        for name in ("seconds", "fps", "max_particles"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise Refusal(f"--{name.replace('_', '-')} must be positive, got {value:g}")
-        effect = effect_told(self, self.output)
+        effect = self.chosen_effect()
         with refusing(OSError):
             self.output.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
-        with refusing(ValueError, FileNotFoundError, OSError):
-            scene = open_scene(self.load_scene, self.data, self.metres_per_unit)
-            say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
-            surface = surface_of(scene, choose_rasterizer(scene.gaussians, "cpu"))
-            clock = Clock(self.fps, max(2, round(self.seconds * self.fps)))
-            history = motion_prior(
-                scene,
-                surface,
-                effect,
-                clock,
-                seed=self.seed,
-                max_particles=self.max_particles,
-                profile=self.physics,
-                everything=self.everything,
-            )
+        scene = self.open_scene()
+        with refusing(ValueError, OSError):
+            prepared = prepare_scene(scene)
+            history = motion_of(prepared, surface_of(scene, prepared.rasterizer), effect, self.simulation)
         found = report(history, effect.material)
         found["scale"] = {"metres_per_unit": scene.frame.metres_per_unit, "source": scene.frame.source}
         found["wall_seconds"] = time.perf_counter() - began

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from pgsd_nerfstudio.effects.effect import Effect, StateLook
 from pgsd_nerfstudio.effects.matter import Array
 
 
+@runtime_checkable
 class Particles(Protocol):
     """The properties of simulated particles that a look depends on; `physics.ParticleHistory` has them."""
 

@@ -29,8 +29,8 @@ HOW_TO_NAME = (
 )
 INSTRUCTIONS = f"""\
 You turn a short description of weather, or of anything else that fills the air, into numbers for a simulation of particles in a
-3D Gaussian Splatting scene: how they look, in the air and landed, and how they move. The numbers turn the knobs of one of four
-base effects; choose the one that moves most like what is described, and numbers that a physicist and a painter would accept.
+3D Gaussian Splatting scene: how they look, in the air and landed, and how they move. The numbers change one of four base
+effects; choose the one that moves most like what is described, and numbers that a physicist and a painter would accept.
 Leave at its default whatever the description says nothing about. If nothing in it could be in the air, base is null.
 Answer with one JSON object and nothing else. It must satisfy this JSON schema:
 {json.dumps(SCHEMA)}"""

@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
-from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.rendering.moment import Moment
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 # By so much a particle may lie outside of the picture and still count as seen:
 SLACK = 0.1  # m, for its size and what it has learned
@@ -90,17 +90,19 @@ def surrogate(
     """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians."""
     total = gradient.new_zeros(())
     squares: dict[str, float] = {}
-    for k, rolled in enumerate(weather):
-        if len(rolled) == 0:
+    for k, gaussians in enumerate(weather):
+        if len(gaussians) == 0:
             continue
-        names = [name for name, tensor in rolled.tensors.items() if tensor.requires_grad]
+        names = [name for name, tensor in gaussians.tensors.items() if tensor.requires_grad]
         if not names:
             continue
-        leaves = {name: getattr(rolled, name).detach().requires_grad_() for name in names}
-        picture = prepared.clip_rasterizer.render(cameras[k], replace(rolled.detach(), **leaves), background, moments[k]).rgb[0]
+        leaves = {name: getattr(gaussians, name).detach().requires_grad_() for name in names}
+        picture = prepared.clip_rasterizer.render(
+            cameras[k], replace(gaussians.detach(), **leaves), background, moments[k]
+        ).rgb[0]
         found = torch.autograd.grad(picture, list(leaves.values()), gradient[k].permute(1, 2, 0), allow_unused=True)
         for name, on_leaf in zip(names, found, strict=True):
             if on_leaf is not None:
-                total = total + (getattr(rolled, name) * on_leaf).sum()
+                total = total + (getattr(gaussians, name) * on_leaf).sum()
                 squares[name] = squares.get(name, 0.0) + float(on_leaf.square().sum())
     return total, {name: square**0.5 for name, square in squares.items()}

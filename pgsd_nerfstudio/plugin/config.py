@@ -6,9 +6,9 @@ the flags are copied into all three as soon as they are parsed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
@@ -19,22 +19,23 @@ from nerfstudio.plugins.types import MethodSpecification
 from rich.console import Console
 
 from pgsd_nerfstudio.plugin.environment import prepare
-from pgsd_nerfstudio.plugin.options import CUDA, WeatherOptions, check_version
+from pgsd_nerfstudio.plugin.options import RunOptions, check_version
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipelineConfig
 from pgsd_nerfstudio.plugin.trainer import WeatherTrainer
+from pgsd_nerfstudio.plugin.training_options import CUDA
+from pgsd_nerfstudio.weather.options import FLAT
 
 prepare()
 
 
 @dataclass
-class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
+class WeatherTrainerConfig(TrainerConfig):
     """Weather for a frozen scene, refined by physics-guided score distillation."""
 
     _target: type = field(default_factory=lambda: WeatherTrainer)
-    data: Path | None = None
-    """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
-    prompt: str | None = None
-    """What the video prior is told; by default the effect's own prompt, or that of --weather, with the scene's description."""
+    run: Annotated[RunOptions, FLAT] = field(default_factory=RunOptions)
+    data: tyro.conf.Suppress[Path | None] = None  # --data is of the scene, --prompt of the guidance
+    prompt: tyro.conf.Suppress[str | None] = None
     method_name: str | None = "pgsd-weather"
     """Method name."""
     machine: MachineConfig = field(default_factory=lambda: MachineConfig(device_type="cuda" if CUDA else "cpu"))
@@ -61,37 +62,30 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
     pipeline: tyro.conf.Suppress[WeatherPipelineConfig] = field(default_factory=WeatherPipelineConfig)
 
     def __post_init__(self) -> None:
-        """Judge the flags, make paths absolute and hand them on; the entry point's own config, without a scene, passes."""
-        if self.load_scene is tyro.MISSING:
+        """Check the flags, make paths absolute and hand them on; the entry point's own config, without a scene, passes."""
+        if self.run.scene.load_scene is tyro.MISSING:
             return
-        if str(self.load_scene) != "demo":
-            self.load_scene = Path(self.load_scene).expanduser().resolve()
-        if self.data is not None:
-            self.data = Path(self.data).expanduser().resolve()
-        if self.llm is not None and self.weather is not None:
-            _say(f"asking {self.llm} what {self.weather!r} means")
-        self.check()
-        self.understand()
+        run, words = self.run.absolute(), self.run.weather
+        if words.llm is not None and words.weather is not None:
+            _say(f"asking {words.llm} what {words.weather!r} means")
+        run.check()
+        self.run = replace(run.with_words_understood(), training_seed=self.machine.seed)
         if self.experiment_name is None:
-            self.experiment_name = self.load_scene.stem
-        self.max_num_iterations, self.training_seed = self.training_steps, self.machine.seed
+            self.experiment_name = run.scene.load_scene.stem
+        self.max_num_iterations = run.training_steps
         self.optimizers = {
             group: {
                 "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
-                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.0, max_steps=self.training_steps),
+                "scheduler": CosineDecaySchedulerConfig(warm_up_end=0, learning_rate_alpha=0.0, max_steps=run.training_steps),
             }
-            for group, rate in self.rates.items()
+            for group, rate in run.rates.items()
         }
-        self.pipeline.share(self.options())
-
-    def options(self) -> WeatherOptions:
-        """The flags of this run alone, without nerfstudio's."""
-        return WeatherOptions(**{f.name: getattr(self, f.name) for f in fields(WeatherOptions)})
+        self.pipeline.share(self.run)
 
     def print_to_terminal(self) -> None:
         """Not all of nerfstudio's fields: what matters is printed as a table once it is settled, the rest is in config.yml.
         Only how the words for the weather were read is said at once, so that a misunderstanding costs nothing."""
-        for remark in self.remarks():
+        for remark in self.run.remarks():
             _say(remark)
 
     def save_config(self) -> None:
@@ -101,9 +95,10 @@ class WeatherTrainerConfig(TrainerConfig, WeatherOptions):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Called when a config.yml is read: other versions are refused, a run that was moved is found where it is now."""
-        check_version(state.get("version"))
+        # Of what the file says: a class knows a version of its own.
+        check_version(vars(state["run"]).get("version") if "run" in state else None)
         self.__dict__.update(state)
-        if self.load_scene is not tyro.MISSING:
+        if self.run.scene.load_scene is not tyro.MISSING:
             self.pipeline.run_folder = self.get_base_dir().resolve()
 
 

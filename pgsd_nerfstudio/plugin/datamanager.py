@@ -15,8 +15,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch import Tensor
 
-from pgsd_nerfstudio.plugin.options import WeatherOptions
-from pgsd_nerfstudio.plugin.prepared_scene import prepare_scene
+from pgsd_nerfstudio.plugin.opening import open_scene
+from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
 from pgsd_nerfstudio.plugin.views import Views
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
@@ -32,7 +32,7 @@ class TrajectoryDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: TrajectoryDataManager)
     dataparser: tyro.conf.Suppress[Any] = field(default_factory=DataParserConfig)
-    options: tyro.conf.Suppress[WeatherOptions] = field(default_factory=WeatherOptions.unset)
+    options: tyro.conf.Suppress[RunOptions] = field(default_factory=RunOptions.unset)
     run_folder: tyro.conf.Suppress[Path | None] = None
 
 
@@ -60,7 +60,7 @@ class TrajectoryDataManager(VanillaDataManager):
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
         self.includes_time = True
-        self.prepared = prepare_scene(config.options, device)
+        self.prepared = open_scene(config.options, device)
         count = len(self.prepared.scene.cameras)
         self.train_dataset = Views(self.prepared, list(range(count)))
         chosen = torch.linspace(0, count - 1, min(EVAL_VIEWS, count)).round().long()
@@ -90,22 +90,23 @@ class TrajectoryDataManager(VanillaDataManager):
 
     def _trajectory(self, step: int, seed: int) -> tuple[NerfstudioCameras, dict[str, Any]]:
         options, views = self.config.options, self.prepared.scene.cameras
-        frames, height, width = options.clip_frames, options.clip_height, options.clip_width
+        clips, weather_frames = options.clips, options.simulation.frames
+        frames, height, width = clips.clip_frames, clips.clip_height, clips.clip_width
         if frames is None or height is None or width is None:
             raise RuntimeError("the clip's size is not known before the video prior is opened")
         draw = torch.Generator().manual_seed(seed * OTHER + step)
         first = int(torch.randint(len(views), (), generator=draw))
-        others = partners(views, first, None if options.trajectory == "any" else NEAREST)
+        others = partners(views, first, None if clips.trajectory == "any" else NEAREST)
         last = int(others[torch.randint(len(others), (), generator=draw)])
-        start = int(torch.randint(options.frames - frames + 1, (), generator=draw))
-        times = torch.arange(start, start + frames) / (options.frames - 1)
+        start = int(torch.randint(weather_frames - frames + 1, (), generator=draw))
+        times = torch.arange(start, start + frames) / (weather_frames - 1)
         path = interpolate(views, first, last, frames).resized(width, height)
         return to_nerfstudio(path, times).to(self.device), {"start": start, "views": (first, last)}
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a clip."""
-        options = self.config.options
-        return (options.clip_frames or 0) * (options.clip_height or 0) * (options.clip_width or 0)
+        clips = self.config.options.clips
+        return (clips.clip_frames or 0) * (clips.clip_height or 0) * (clips.clip_width or 0)
 
     def get_eval_rays_per_batch(self) -> int:
         """Pixels of a clip."""

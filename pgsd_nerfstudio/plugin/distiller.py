@@ -18,7 +18,7 @@ from pgsd_nerfstudio.guidance.tiny_vae import TinyEncoder, gradient_cosine
 from pgsd_nerfstudio.guidance.variants import Embeddings
 from pgsd_nerfstudio.guidance.video_prior import VideoPrior
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.options import RunOptions
 
 PAPER_FRAMES = 9
 
@@ -40,21 +40,22 @@ class Distiller:
     seed: int
 
     @staticmethod
-    def listening(prior: VideoPrior, options: WeatherOptions, description: str) -> Distiller:
+    def of(prior: VideoPrior, options: RunOptions, description: str) -> Distiller:
         """A distiller toward the effect's prompt for a scene that is called `description`.
 
         Raises:
             RunError: the text encoder cannot be used.
         """
         effect = options.chosen_effect()
-        unwanted = effect.negative_prompt if options.negative_prompt is None else options.negative_prompt
-        prompts = prompts_for(effect.name, options.prompt or effect.prompt, unwanted, description)
+        guidance = options.guidance
+        unwanted = effect.negative_prompt if guidance.negative_prompt is None else guidance.negative_prompt
+        prompts = prompts_for(effect.name, guidance.prompt or effect.prompt, unwanted, description)
         try:
-            embeddings = embed_texts(prior, prompts.needed(options.distillation.variant))
+            embeddings = embed_texts(prior, prompts.needed(guidance.distillation.variant))
         except (ValueError, OSError) as error:
             raise RunError(str(error)) from error
         steps, seed = options.training_steps, options.training_seed
-        return Distiller(prior, prompts.text, unwanted, embeddings, options.distillation, TimestepSchedule(), steps, seed)
+        return Distiller(prior, prompts.text, unwanted, embeddings, guidance.distillation, TimestepSchedule(), steps, seed)
 
     def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:
         """Which way the clip should change, in training step `step`; the noise depends on the seed and the step only.
@@ -72,26 +73,28 @@ class Distiller:
             raise RunError(str(error)) from error
 
 
-def open_prior(options: WeatherOptions, device: torch.device | str) -> tuple[VideoPrior, WeatherOptions]:
+def open_prior(options: RunOptions, device: torch.device | str) -> tuple[VideoPrior, RunOptions]:
     """The video prior of a run, and the options with the size of the training clips settled.
 
     Raises:
         RunError: the prior cannot be used, or the weather is shorter than a clip.
     """
+    guidance, clips, simulation = options.guidance, options.clips, options.simulation
     try:
-        prior = load_prior(options.prior, device, frames=options.clip_frames)
+        prior = load_prior(guidance.prior, device, frames=clips.clip_frames)
         own, height, width = prior.clip_shape
-        frames = options.clip_frames or min(own, PAPER_FRAMES)
-        if options.tiny_vae is not None:
-            prior = _through_tiny(prior, options.tiny_vae, frames)
+        frames = clips.clip_frames or min(own, PAPER_FRAMES)
+        if guidance.tiny_vae is not None:
+            prior = _through_tiny(prior, guidance.tiny_vae, frames)
     except (ValueError, OSError) as error:
         raise RunError(str(error)) from error
-    if options.frames < frames:
+    if simulation.frames < frames:
         raise RunError(
-            f"the weather has {options.frames} frames ({options.seconds:g} s), a training clip {frames}: use more --seconds"
+            f"the weather has {simulation.frames} frames ({simulation.seconds:g} s), a training clip {frames}: "
+            "use more --seconds"
         )
-    sizes = {"clip_height": options.clip_height or height, "clip_width": options.clip_width or width}
-    return prior, replace(options, clip_frames=frames, **sizes)
+    sizes = {"clip_height": clips.clip_height or height, "clip_width": clips.clip_width or width}
+    return prior, replace(options, clips=replace(clips, clip_frames=frames, **sizes))
 
 
 def _through_tiny(prior: VideoPrior, weights: Path, frames: int) -> VideoPrior:

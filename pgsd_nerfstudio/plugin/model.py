@@ -22,20 +22,20 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from pgsd_nerfstudio.dynamics import Deformation, DeformedCloud, DynamicsField, LearnedLook, Rollout
-from pgsd_nerfstudio.effects import InitialLook, initial_look
+from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
-from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.splat import splat_tensors
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.response.answer import Answer, Shown, baked
-from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
+from pgsd_nerfstudio.weather.weather import Weather
 
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
 STRIDE = 8  # frames between kept states: a jump in time, and what lies in a training clip, costs 3.5 frames on average
@@ -46,7 +46,7 @@ class WeatherModelConfig(SplatfactoModelConfig):
     """A splatfacto by type, since viewer and ns-export ask for that; none of its training is used."""
 
     _target: type = field(default_factory=lambda: WeatherModel)
-    options: tyro.conf.Suppress[WeatherOptions] = field(default_factory=WeatherOptions.unset)
+    options: tyro.conf.Suppress[RunOptions] = field(default_factory=RunOptions.unset)
 
 
 class WeatherModel(SplatfactoModel):
@@ -54,31 +54,40 @@ class WeatherModel(SplatfactoModel):
 
     config: WeatherModelConfig
 
-    def __init__(
-        self,
-        *args: Any,
-        prepared: PreparedScene,
-        history: ParticleHistory,
-        answer: Answer,
-        exporting: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        """`prepared`, `history` and `answer` stay outside of the module's state; `exporting`: `gauss_params` are asked for in
-        earnest."""
-        self.prepared, self.history, self.answer, self.exporting = prepared, history, answer, exporting
+    def __init__(self, *args: Any, made: Weather, exporting: bool = False, **kwargs: Any) -> None:
+        """Wrap a weather, which stays outside of the module's state.
+
+        Args:
+            args: of nerfstudio's models.
+            made: the weather of the run, simulated.
+            exporting: whether `gauss_params` are asked for in earnest.
+            kwargs: of nerfstudio's models.
+        """
+        self.made, self.exporting = made, exporting
         super().__init__(*args, **kwargs)
+
+    @property
+    def prepared(self) -> PreparedScene:
+        """The frozen scene on the model's device."""
+        return self.made.prepared
+
+    @property
+    def history(self) -> ParticleHistory:
+        """The simulated motion."""
+        return self.made.history
+
+    @property
+    def answer(self) -> Answer:
+        """How the frozen scene looks under the weather."""
+        return self.made.answer
 
     def populate_modules(self) -> None:
         Model.populate_modules(self)  # not splatfacto's, which needs CUDA and downloads weights
-        options = self.config.options
-        look = initial_look(options.chosen_effect(), self.history, seed=options.weather_seed)
-        look = in_place(
-            look, self.history, self.answer, self.prepared.scene.frame.to_metric(self.prepared.scene.gaussians.means)
-        )
         self.look = LearnedLook().to(self.history.device)
-        self.field, self.rollout = self._moving(look)
+        self.field, self.rollout = self._sequence()
+        self.made = self.made.shown_by(self.rollout)
         self._refreshed: dict[str, Tensor] | None = None
-        self.weather = Panel(self.prepared.scene, options.seconds)
+        self.weather = Panel(self.prepared.scene, self.config.options.simulation.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
         self._untimed = 0
@@ -86,21 +95,20 @@ class WeatherModel(SplatfactoModel):
         self._cropped_answer: tuple[int, Tensor, Answer] | None = None
         self._exported: dict[str, Tensor] | None = None
 
-    def _moving(self, look: InitialLook) -> tuple[torch.nn.Module, Rollout | DeformedCloud]:
-        """What is learned of motion and appearance, and what rolls it out."""
-        options = self.config.options
+    def _sequence(self) -> tuple[torch.nn.Module, GaussianSequence]:
+        """What is learned of motion and appearance, and the sequence that shows it."""
+        options, history, look = self.config.options.motion, self.history, self.made.sequence.look
         if options.motion == "deformation":
-            box = torch.tensor(self.history.about["domain"]).reshape(2, 3).to(self.history.device)
-            deformation = Deformation(box, self.history.frames).to(self.history.device)
-            return deformation, DeformedCloud(self.history, look, deformation, self.look)
-        dynamics = DynamicsField.for_history(self.history, config=options.dynamics)
-        exposure = options.chosen_effect().appearance.exposure
-        how = {"stride": STRIDE, "exposure": exposure, "motion": options.motion}
-        return dynamics, Rollout(self.history, look, dynamics, self.look, **how)
+            box = torch.tensor(history.about["domain"]).reshape(2, 3).to(history.device)
+            deformation = Deformation(box, history.frames).to(history.device)
+            return deformation, DeformedCloud(history, look, deformation, self.look)
+        dynamics = DynamicsField.for_history(history, config=options.dynamics)
+        how = {"stride": STRIDE, "exposure": self.made.effect.appearance.exposure, "motion": options.motion}
+        return dynamics, Rollout(history, look, dynamics, self.look, **how)
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Weights with which the states were made that clips take what lies from: interrupted training goes on with them."""
-        return dict(getattr(self.rollout, "refreshed", None) or {})
+        return dict(self.rollout.refreshed or {})
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         self._refreshed = state or None
@@ -132,8 +140,8 @@ class WeatherModel(SplatfactoModel):
 
     def weather_at(self, frame: int) -> Gaussians:
         """The weather's Gaussians in scene units at a frame of its time line, learned refinements included."""
-        with torch.no_grad(), uninterrupted():
-            return self.prepared.scene.frame.gaussians_to_scene(self.rollout.gaussians(frame))
+        with uninterrupted():
+            return self.made.gaussians(frame)
 
     def moment(self, frame: int, answer: Answer | None = None) -> Shown | None:
         """How the frozen scene looks at a frame; None: as it was trained."""

@@ -29,8 +29,8 @@ from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, Trajectory
 from pgsd_nerfstudio.plugin.distiller import Distiller, open_prior
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig, fidelity
-from pgsd_nerfstudio.plugin.motion import prepare_motion, stored_motion
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.opening import prepare_weather, stored_weather
+from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.summary import print_summary
 
@@ -47,10 +47,10 @@ class WeatherPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: WeatherPipeline)
     datamanager: TrajectoryDataManagerConfig = field(default_factory=TrajectoryDataManagerConfig)
     model: WeatherModelConfig = field(default_factory=WeatherModelConfig)
-    options: WeatherOptions = field(default_factory=WeatherOptions.unset)
+    options: RunOptions = field(default_factory=RunOptions.unset)
     run_folder: Path | None = None
 
-    def share(self, options: WeatherOptions) -> None:
+    def share(self, options: RunOptions) -> None:
         """One record of options for all three."""
         self.options = self.datamanager.options = self.model.options = options
 
@@ -93,20 +93,18 @@ class WeatherPipeline(VanillaPipeline):
         self.datamanager = config.datamanager.setup(
             device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
         )
-        found = stored_motion if prior is None else prepare_motion
-        prepared, history, answer = found(self.datamanager.prepared, config.options, config.run_folder)
+        found = stored_weather if prior is None else prepare_weather
+        weather = found(self.datamanager.prepared, config.options, config.run_folder)
         self._model = config.model.setup(
             scene_box=self.datamanager.train_dataset.scene_box,
             num_train_data=len(self.datamanager.train_dataset),
-            prepared=prepared,
-            history=history.to(device),
-            answer=answer.to(device),
+            made=weather,
             exporting=test_mode == "inference",
         )
         self._model.to(device)
         if prior is not None:
-            self.distiller = Distiller.listening(prior, config.options, prepared.scene.description)
-            print_summary(console, config.options, prepared, history, self.distiller)
+            self.distiller = Distiller.of(prior, config.options, weather.scene.description)
+            print_summary(console, config.options, weather, self.distiller)
 
     @property
     def model(self) -> WeatherModel:
@@ -117,7 +115,7 @@ class WeatherPipeline(VanillaPipeline):
         """Say once what pressing the frozen scene into layers costs in accuracy, on the first clip of the run."""
         self._layers_judged = True
         psnr = -10.0 * float((clip - exact).square().mean().clamp_min(1e-20).log10())
-        console.print(f"layers {self.config.options.layers}: the first clip lies {psnr:.1f} dB from the exact one")
+        console.print(f"layers {self.config.options.clips.layers}: the first clip lies {psnr:.1f} dB from the exact one")
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
         """Losses of one clip: score distillation of the video, and what holds motion and look near the simulation.
@@ -133,13 +131,13 @@ class WeatherPipeline(VanillaPipeline):
         views, start = from_nerfstudio(cameras), int(batch["start"])
         background = model.background_color.to(prepared.device)
         model.go_on()
-        if step % options.refresh_every == 0:
+        if step % options.learning.refresh_every == 0:
             with watch("refresh"):
                 model.rollout.refresh()
         with watch("roll-out"):
             # What is deformed is not where it was scattered.
-            seen = None if options.motion == "deformation" else seen_by(prepared, views, model.history, start)
-            how = {"begin": options.begin, "gradient_frames": options.gradient_frames}
+            seen = None if options.motion.motion == "deformation" else seen_by(prepared, views, model.history, start)
+            how = {"begin": options.motion.begin, "gradient_frames": options.motion.gradient_frames}
             rolled = model.rollout.window(start, len(views), visible=seen, **how)
             weather = [prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
         with watch("render"):
@@ -153,14 +151,14 @@ class WeatherPipeline(VanillaPipeline):
             distilled = self._distilled(clip, step)
         with watch("render, backward"):
             video, norms = surrogate(prepared, views, weather, background, moments, distilled.gradient)
+        weights = options.motion.regularization
         with watch("regularize"):
-            terms = regularization(rolled, model.look, options.regularization.form)
-            scale = regularization_scale(options.weights, distilled.loss, step, options.training_steps)
-            weights = options.regularization
+            terms = regularization(rolled, model.look, weights.form)
+            scale = regularization_scale(options.motion.weights, distilled.loss, step, options.training_steps)
             losses = weights.weighted(terms, scale)
         with torch.no_grad():
             metres = drift(rolled)
-        if options.clip_every and step % options.clip_every == 0:
+        if options.clips.clip_every and step % options.clips.clip_every == 0:
             writer.put_image("clip", torch.cat(list(clip), dim=2).permute(1, 2, 0).cpu(), step)
         # The number shown is |L_SDS|, the gradient that of the surrogate.
         losses = {"video": video - video.detach() + distilled.loss, **losses}
@@ -195,7 +193,7 @@ class WeatherPipeline(VanillaPipeline):
     def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
         """Drift over one window that training does not see."""
         _, batch = self.datamanager.next_eval(step)
-        start, frames = int(batch["start"]), self.config.options.clip_frames or 1
+        start, frames = int(batch["start"]), self.config.options.clips.clip_frames or 1
         metres = drift(self.model.rollout.frames(start, start + frames))
         return {}, {"drift_m": torch.tensor(metres)}, {}
 
@@ -205,7 +203,7 @@ class WeatherPipeline(VanillaPipeline):
         if not isinstance(rollout, Rollout):
             return {}
         starts = [int(self.datamanager.next_eval(index)[1]["start"]) for index in range(GAP_CLIPS)]
-        return gaps(rollout, [(start, self.config.options.clip_frames or 1) for start in starts])
+        return gaps(rollout, [(start, self.config.options.clips.clip_frames or 1) for start in starts])
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """After each step the norms of its gradients go to the log."""

@@ -12,28 +12,8 @@ import yaml
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
 
-from pgsd_nerfstudio.plugin.environment import allow_numpy_scalars
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.loading import load_scene
-from pgsd_nerfstudio.scene.scene import Scene, SceneError
-
-
-def open_scene(
-    path: str | Path,
-    data: str | Path | None = None,
-    metres_per_unit: float | None = None,
-    description: str | None = None,
-) -> Scene:
-    """`load_scene` that also knows the cameras of a splatfacto run folder.
-
-    Raises:
-        SceneError: the input cannot be used; the sentence says why and what to do.
-    """
-    try:
-        return load_scene(path, data, metres_per_unit=metres_per_unit, description=description, run_cameras=run_cameras)
-    finally:
-        # Reading a checkpoint allows them for a while; when that ends, torch forgets that they were allowed before, too.
-        allow_numpy_scalars()
+from pgsd_nerfstudio.scene.scene import SceneError
 
 
 def run_cameras(config_path: Path) -> tuple[Cameras, tuple[Path, ...]]:

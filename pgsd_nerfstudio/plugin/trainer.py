@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any, Literal
 
 from nerfstudio.engine.trainer import Trainer
@@ -10,7 +9,6 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.options import WeatherOptions
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
 
 NAMES = {"simulation": "simulation", "rollout": "roll-out"}
@@ -30,9 +28,7 @@ class WeatherTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """As nerfstudio; then config.yml is written again with the defaults that only the opened video prior could tell."""
         super().setup(test_mode)
-        settled = self.config.pipeline.options
-        for f in fields(WeatherOptions):
-            setattr(self.config, f.name, getattr(settled, f.name))
+        self.config.run = self.config.pipeline.options
         self.config.save_config()
 
     def train(self) -> None:

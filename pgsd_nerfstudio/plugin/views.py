@@ -12,9 +12,9 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
-from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
 from pgsd_nerfstudio.storage import cache_dir
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 
 class Views(InputDataset):

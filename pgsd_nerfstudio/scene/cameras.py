@@ -37,11 +37,11 @@ class Cameras:
         return Cameras(self.viewmats[index], self.Ks[index], self.width, self.height)
 
     @staticmethod
-    def from_opengl(c2w: Float[Tensor, "t 3|4 4"], Ks: Float[Tensor, "t 3 3"], width: int, height: int) -> Cameras:
+    def from_opengl(c2w: Float[Tensor, "t rows 4"], Ks: Float[Tensor, "t 3 3"], width: int, height: int) -> Cameras:
         """Cameras from nerfstudio's matrices.
 
         Args:
-            c2w: camera to world, OpenGL axes, scene units.
+            c2w: camera to world, OpenGL axes, scene units; three rows, or four of which the last does not matter.
             Ks: intrinsics in pixels.
             width: of the images in pixels.
             height: of the images in pixels.

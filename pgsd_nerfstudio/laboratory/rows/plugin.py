@@ -16,10 +16,12 @@ from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.physics import Clock, Domain, simulate_metric
 from pgsd_nerfstudio.plugin.clip import seen_by, surrogate
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.options import WeatherOptions
-from pgsd_nerfstudio.plugin.prepared_scene import PreparedScene, prepare_scene
+from pgsd_nerfstudio.plugin.opening import open_scene
+from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.scene.cameras import interpolate
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.options import SceneOptions, SimulationOptions
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 FRAMES, WIDTH, HEIGHT = 9, 96, 64
 START = 30
@@ -29,7 +31,7 @@ TARGET = "<= 2.5"  # s, of a training step on two cores
 
 def verify(quick: bool) -> list[Record]:
     """The gradient that is carried back frame by frame, against one graph over the clip."""
-    prepared = prepare_scene(WeatherOptions(load_scene=Path("demo")), "cpu")
+    prepared = open_scene(_options(), "cpu")
     rollout = _rollout(300 if quick else 2000)
     return [
         Record.judged(
@@ -50,6 +52,7 @@ def bench(quick: bool) -> list[Record]:
         return [Record("training step", None, "s", source=f"not measurable here: {error}")]
     stages: dict[str, list[float]] = {}
     aloft, seen, options, history = [], [], pipeline.config.options, pipeline.model.history
+    clips = options.clips
     for step in range(0, 3 if quick else 8):
         found, frame, particles = _step(pipeline, step)
         for name, seconds in found.items():
@@ -57,12 +60,12 @@ def bench(quick: bool) -> list[Record]:
         aloft.append(len(history.active(frame)))
         seen.append(particles)
     refresh = stages.pop("refresh")[0]
-    stages["refresh, its share"] = [refresh / options.refresh_every]
+    stages["refresh, its share"] = [refresh / options.learning.refresh_every]
     error = _gradient_error(pipeline.model.prepared, _rollout(300))
     source = (
         f"demo, {statistics.mean(aloft):,.0f} particles in the air, {statistics.mean(seen):,.0f} seen by the clip, "
-        f"{options.clip_frames} frames of {options.clip_width}x{options.clip_height}, {options.prior} prior, median of "
-        f"{len(stages['whole step']) - 1} steps, a refresh of {refresh:.2g} s every {options.refresh_every}"
+        f"{clips.clip_frames} frames of {clips.clip_width}x{clips.clip_height}, {options.guidance.prior} prior, median of "
+        f"{len(stages['whole step']) - 1} steps, a refresh of {refresh:.2g} s every {options.learning.refresh_every}"
     )
     paid = {"error": error, "error_unit": "relative L2 of the gradient", "source": source}
     # The first step prepares things for the first time.
@@ -74,6 +77,11 @@ def bench(quick: bool) -> list[Record]:
     ]
 
 
+def _options() -> RunOptions:
+    """Snow for the demo, with so many active particles that 20,000 are active in the mean."""
+    return RunOptions(scene=SceneOptions(load_scene=Path("demo")), simulation=SimulationOptions(max_particles=MOST))
+
+
 def _pipeline() -> Any:
     """A pipeline under training, as the Trainer makes it, whose field has learned something."""
     from torch.amp.grad_scaler import GradScaler
@@ -81,7 +89,7 @@ def _pipeline() -> Any:
     from pgsd_nerfstudio.plugin.config import WeatherTrainerConfig
 
     torch.manual_seed(0)
-    config = WeatherTrainerConfig(load_scene=Path("demo"), max_particles=MOST)
+    config = WeatherTrainerConfig(run=_options())
     device = config.machine.device_type
     pipeline = config.pipeline.setup(device=device, test_mode="val", grad_scaler=GradScaler(device, enabled=False))
     with torch.no_grad():

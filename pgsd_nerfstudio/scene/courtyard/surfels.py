@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import roma
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 Array = NDArray[np.float64]
+Vector = Array | Sequence[float]
 
 FILL = 0.63  # standard deviation / cell width; between neighbours at most 3 % of the background shows
 THICKNESS = 0.12  # of the smaller standard deviation, across the surface
@@ -38,7 +39,7 @@ class Patch:
     def __len__(self) -> int:
         return len(self.position)
 
-    def moved(self, offset: ArrayLike, turn: float = 0.0) -> Patch:
+    def moved(self, offset: Vector, turn: float = 0.0) -> Patch:
         """Turned about the z axis by `turn` radians, then shifted."""
         shift, c, s = np.asarray(offset, float), np.cos(turn), np.sin(turn)
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -83,7 +84,7 @@ def join(patches: Sequence[Patch]) -> Patch:
     return Patch(vertices, triangles, *samples)
 
 
-def samples(position: Array, normal: ArrayLike, tangent: ArrayLike, size: ArrayLike) -> Patch:
+def samples(position: Array, normal: Vector, tangent: Vector, size: Vector) -> Patch:
     """Samples without triangles.
 
     Args:
@@ -114,7 +115,7 @@ def cells(length: float, spacing: float, edge: float | None = None) -> tuple[Arr
     return np.cumsum(widths) - widths / 2, widths
 
 
-def rectangle(corner: ArrayLike, u: ArrayLike, v: ArrayLike, spacing: tuple[float, float], edge: float | None = None) -> Patch:
+def rectangle(corner: Vector, u: Vector, v: Vector, spacing: tuple[float, float], edge: float | None = None) -> Patch:
     """A rectangle of two triangles.
 
     Args:
@@ -135,7 +136,7 @@ def rectangle(corner: ArrayLike, u: ArrayLike, v: ArrayLike, spacing: tuple[floa
     )
 
 
-def box(lower: ArrayLike, upper: ArrayLike, spacing: tuple[float, float], edge: float | None = None, hidden: str = "") -> Patch:
+def box(lower: Vector, upper: Vector, spacing: tuple[float, float], edge: float | None = None, hidden: str = "") -> Patch:
     """An upright block.
 
     Args:

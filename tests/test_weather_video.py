@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pgsd_nerfstudio.cli.video import _beside, _encoder, to_bytes, write_picture, write_video
+from pgsd_nerfstudio.weather.video import _beside, _encoder, to_bytes, write_picture, write_video
 from pgsd_nerfstudio.scene.camera_path import DEGREES_PER_SECOND, choose_views, fly
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame

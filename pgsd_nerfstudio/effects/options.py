@@ -1,4 +1,4 @@
-"""What the weather is: the flags that `pgsd preview`, `pgsd simulate` and `ns-train pgsd-weather` share, and their Effect.
+"""What the weather is: the options that `pgsd preview`, `pgsd simulate` and `ns-train pgsd-weather` share, and their Effect.
 
 The text under each field is its --help; lines end there where a sentence may, since tyro keeps the breaks. Factors are applied
 as those of a request are (application.py); numbers with a unit take the place of what effect or words say. Turbulence follows
@@ -35,9 +35,9 @@ RANGES: dict[str, tuple[float, float, str]] = {
 """Least and greatest value, and its unit; amount and size have a request's, the rest is judged by the parts of an Effect."""
 
 
-@dataclass(kw_only=True)
-class Knobs:
-    """What the weather is. Not frozen, since nerfstudio's configurations are not and inherit it."""
+@dataclass(frozen=True, kw_only=True)
+class EffectOptions:
+    """What the weather is; `resolve` gives the Effect."""
 
     effect: str = "snowfall"
     """Which weather: snowfall, rainfall, fog or sandstorm."""
@@ -81,31 +81,31 @@ class Knobs:
     ambience: tyro.conf.FlagConversionOff[bool] = True
     """Whether light and sky follow the weather. False: they stay as captured."""
     exposure: float | None = None
-    """Shutter time in seconds: what flies is smeared by speed times this (a film camera: 0.02).
+    """Shutter time in seconds: active particles are smeared by speed times this (a film camera: 0.02).
     By default the effect's own, which for snow is 0, no motion blur."""
 
-    def effect_asked(self, cache_dir: Path | None = None) -> tuple[Effect, list[str]]:
-        """The effect with all knobs turned, and what is to be said about it: how the words were read, what cannot be done.
+    def resolve(self, cache_dir: Path | None = None) -> tuple[Effect, list[str]]:
+        """The effect of these options, and what is to be said about it: how the words were read, what cannot be done.
 
         Args:
             cache_dir: folder of what language models answered; the common cache if none is given.
 
         Raises:
-            ValueError: a knob cannot be used, or the words name nothing that could be in the air; one sentence says why.
+            ValueError: an option cannot be used, or the words name nothing that could be in the air; one sentence says why.
             OSError: the answer of a language model cannot be written.
         """
-        return self.turned(self.asked(cache_dir))
+        return self.resolve_understood(self.understand(cache_dir))
 
-    def asked(self, cache_dir: Path | None = None) -> Understanding | None:
-        """What the words for the weather ask for, None without words; raises as `effect_asked`."""
-        self.judge()
+    def understand(self, cache_dir: Path | None = None) -> Understanding | None:
+        """What the words for the weather ask for, None without words; raises as `resolve`."""
+        self.check()
         return None if self.weather is None else _asked(self.weather, self.llm, self.llm_url, cache_dir)
 
-    def turned(self, asked: Understanding | None) -> tuple[Effect, list[str]]:
-        """The effect asked for, with all other knobs turned, and what is to be said about it; raises as `effect_asked`."""
-        self.judge()
-        effect, said = self._base(asked)
-        # Words and knobs are applied one after the other: their factors multiply.
+    def resolve_understood(self, understanding: Understanding | None) -> tuple[Effect, list[str]]:
+        """The effect asked for, with all other options applied, and what is to be said about it; raises as `resolve`."""
+        self.check()
+        effect, said = self._base(understanding)
+        # Words and options are applied one after the other: their factors multiply.
         effect, lacks = self._factors(effect)
         said += [*lacks, *self._lacks(effect)]
         effect = replace(
@@ -118,16 +118,16 @@ class Knobs:
         )
         return effect, said
 
-    def judge(self) -> None:
+    def check(self) -> None:
         """Refuse what can be refused without asking anyone.
 
         Raises:
-            ValueError: two knobs do not go together, or a number is out of its range.
+            ValueError: two options do not go together, or a number is out of its range.
         """
         from pgsd_nerfstudio.effects.language_model import check_model
         from pgsd_nerfstudio.effects.request import LIMITS
 
-        if self.weather is not None and self.effect != Knobs.effect:
+        if self.weather is not None and self.effect != EffectOptions.effect:
             raise ValueError(
                 f"--weather stands in place of --effect, got both {self.weather!r} and {self.effect}: leave out one"
             )
@@ -142,14 +142,14 @@ class Knobs:
             if value is not None and not low <= value <= high:
                 raise ValueError(f"--{name.replace('_', '-')} must lie in {low:g}-{high:g}{unit}, got {value:g}")
 
-    def _base(self, asked: Understanding | None) -> tuple[Effect, list[str]]:
+    def _base(self, understanding: Understanding | None) -> tuple[Effect, list[str]]:
         """The effect of that name or of those words, at the intensity and exposure that are given."""
         from pgsd_nerfstudio.effects.application import applied, remarks
         from pgsd_nerfstudio.effects.effect import effect as named
 
-        if asked is None:
+        if understanding is None:
             return named(self.effect, intensity=self.intensity, exposure=self.exposure), []
-        request, said = asked.request, [asked.remark]
+        request, said = understanding.request, [understanding.remark]
         if self.intensity is not None and request.amount != 1:
             said.append(f"--intensity {self.intensity:g} takes the place of amount {request.amount:g}")
             request = replace(request, amount=1.0)
@@ -162,7 +162,7 @@ class Knobs:
         return effect, said
 
     def _factors(self, effect: Effect) -> tuple[Effect, tuple[str, ...]]:
-        """The knobs that a request has too; only what the video model is told stays."""
+        """The options that a request has too; only what the video model is told stays."""
         from pgsd_nerfstudio.effects.application import applied, remarks
         from pgsd_nerfstudio.effects.request import Request
 

@@ -25,22 +25,23 @@ from pgsd_nerfstudio.effects import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL,
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.application import applied
 from pgsd_nerfstudio.effects.haze import Haze
-from pgsd_nerfstudio.effects.knobs import Knobs, colour_of
+from pgsd_nerfstudio.effects.options import EffectOptions, colour_of
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.laws.populations import extinction, fall_speed, integral, number_density
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.options import RunOptions
+from pgsd_nerfstudio.weather.options import SceneOptions, SimulationOptions
 
 NAMES = sorted(EFFECTS)
-COMMANDS = (Preview, Simulate, WeatherOptions)
+COMMANDS = (Preview, Simulate, RunOptions)
 
 
 def turned(name: str = "snowfall", **knobs: Any) -> Effect:
-    return Knobs(effect=name, **knobs).effect_asked()[0]
+    return EffectOptions(effect=name, **knobs).resolve()[0]
 
 
 def said(**knobs: Any) -> str:
-    return "\n".join(Knobs(**knobs).effect_asked()[1])
+    return "\n".join(EffectOptions(**knobs).resolve()[1])
 
 
 def changed(effect: Effect, base: Effect) -> set[str]:
@@ -59,7 +60,7 @@ def changed(effect: Effect, base: Effect) -> set[str]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_knobs_that_nobody_turned_give_the_effect_itself(name):
-    assert Knobs(effect=name).effect_asked() == (EFFECTS[name], [])
+    assert EffectOptions(effect=name).resolve() == (EFFECTS[name], [])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -78,7 +79,7 @@ def test_twice_the_amount_is_twice_the_water_or_the_extinction(name):
 def test_an_amount_is_of_the_intensity_that_is_given():
     assert turned(intensity=2.0, amount=3.0).emission.intensity == 6.0
     assert turned("fog", intensity=200.0, amount=4.0).emission.intensity == 50.0
-    assert "would be 150 mm/h of water: 100 it is" in said(intensity=50.0, amount=3.0)
+    assert "would be 150 mm/h of water, but snowfall takes 0-100: 100 is used" in said(intensity=50.0, amount=3.0)
 
 
 def test_particles_are_wider_by_the_size():
@@ -111,9 +112,9 @@ def test_the_wind_blows_to_where_it_is_asked_to():
 
 
 def test_wind_after_words_of_still_air_has_turbulence_again():
-    words = Knobs(weather="purple snow, no wind")
-    assert words.effect_asked()[0].wind.speed == 0
-    assert replace(words, wind=2 * SNOWFALL.wind.speed).effect_asked()[0].wind == turned(wind=2 * SNOWFALL.wind.speed).wind
+    words = EffectOptions(weather="purple snow, no wind")
+    assert words.resolve()[0].wind.speed == 0
+    assert replace(words, wind=2 * SNOWFALL.wind.speed).resolve()[0].wind == turned(wind=2 * SNOWFALL.wind.speed).wind
     assert turned(wind=2 * SNOWFALL.wind.speed).wind.turbulence == pytest.approx(2 * SNOWFALL.wind.turbulence)
 
 
@@ -194,23 +195,23 @@ def test_light_and_exposure_are_knobs_of_their_own(name, monkeypatch):
 
 
 def test_factors_of_words_and_knobs_multiply_and_what_is_given_in_a_unit_wins():
-    words = Knobs(weather="heavy big rain")
+    words = EffectOptions(weather="heavy big rain")
     request = read("heavy big rain").request
-    effect = replace(words, amount=1.5, size=1.2).effect_asked()[0]
+    effect = replace(words, amount=1.5, size=1.2).resolve()[0]
     assert effect.emission.intensity == pytest.approx(RAINFALL.emission.intensity * request.amount * 1.5)
     own, wide = (each.appearance.active.scale_per_diameter[0] for each in (RAINFALL, effect))
     assert wide == pytest.approx(own * request.size * 1.2)
-    effect, remarks = replace(words, intensity=3.0).effect_asked()
+    effect, remarks = replace(words, intensity=3.0).resolve()
     assert effect.emission.intensity == 3.0
     assert "--intensity 3 takes the place of amount 2" in remarks
     assert effect.prompt == request.prompt
     # The visibility that is given, in as many parcels as if no word had been said.
-    assert Knobs(weather="dense fog", intensity=FOG.emission.intensity).effect_asked()[0].emission == FOG.emission
+    assert EffectOptions(weather="dense fog", intensity=FOG.emission.intensity).resolve()[0].emission == FOG.emission
 
 
 def test_the_prompt_stays_that_of_effect_or_words():
     assert turned("fog", color="green", amount=2.0).prompt == FOG.prompt
-    assert Knobs(weather="purple snow", color="green").effect_asked()[0].prompt == read("purple snow").request.prompt
+    assert EffectOptions(weather="purple snow", color="green").resolve()[0].prompt == read("purple snow").request.prompt
 
 
 # What is refused.
@@ -254,7 +255,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("knobs", "sentence"), REFUSED)
 def test_what_cannot_be_used_is_refused_in_one_sentence(knobs, sentence):
     with pytest.raises(ValueError) as refused:
-        Knobs(**knobs).effect_asked()
+        EffectOptions(**knobs).resolve()
     assert sentence in str(refused.value) and "\n" not in str(refused.value)
 
 
@@ -270,14 +271,13 @@ def test_a_command_refuses_before_anything_is_written(command, tmp_path, capsys,
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_takes_over_all_knobs_as_they_are(command):
+def test_every_command_holds_the_same_records(command):
+    """So there is one text of --help, one default and one check of each option."""
     own = {field.name: field for field in fields(command)}
-    for knob in fields(Knobs):
-        assert (own[knob.name].type, own[knob.name].default) == (knob.type, knob.default), knob.name
-    redeclared = {knob.name for knob in fields(Knobs)} & {
-        n for c in command.__mro__ if c is not Knobs for n in vars(c).get("__annotations__", ())
-    }
-    assert redeclared == set()  # so that there is one text of --help
+    for name, record in (("scene", SceneOptions), ("weather", EffectOptions), ("simulation", SimulationOptions)):
+        assert own[name].default_factory is record, name
+        redeclared = {field.name for field in fields(record)} & set(own) - {"scene", "weather", "simulation"}
+        assert redeclared == set()
 
 
 FLAGS = (
@@ -291,15 +291,15 @@ def test_the_same_flags_mean_the_same_effect_in_all_commands():
     effects = []
     for command in COMMANDS:
         parsed = tyro.cli(command, args=["--load-scene", "demo", *FLAGS])
-        assert {flag.lstrip("-").replace("-", "_") for flag in FLAGS[::2]} <= {field.name for field in fields(Knobs)}
-        effects.append(parsed.effect_asked())
+        assert {flag.lstrip("-").replace("-", "_") for flag in FLAGS[::2]} <= {field.name for field in fields(EffectOptions)}
+        effects.append(parsed.weather.resolve())
     assert effects[0] == effects[1] == effects[2]
     effect = effects[0][0]
     assert (effect.emission.intensity, effect.wind.direction_degrees, effect.ambience) == (3.75, -45.0, None)
 
 
 def test_flags_that_are_tried_here_are_all_there_are():
-    assert {field.name for field in fields(Knobs)} - {flag.lstrip("-").replace("-", "_") for flag in FLAGS[::2]} == {
+    assert {field.name for field in fields(EffectOptions)} - {flag.lstrip("-").replace("-", "_") for flag in FLAGS[::2]} == {
         "effect",
         "llm",
         "llm_url",
@@ -312,9 +312,9 @@ def test_flags_that_are_tried_here_are_all_there_are():
 @needs_library
 def test_a_language_model_is_asked_once_and_said_to_have_been(protocol, tmp_path):  # noqa: F811
     with serving(protocol, json.dumps(GOOD)) as server:
-        knobs = Knobs(weather="purple snow", llm=server.model, llm_url=server.url, size=2.0)
-        effect, remarks = knobs.effect_asked(tmp_path)
-        assert knobs.effect_asked(tmp_path) == (effect, remarks)
+        knobs = EffectOptions(weather="purple snow", llm=server.model, llm_url=server.url, size=2.0)
+        effect, remarks = knobs.resolve(tmp_path)
+        assert knobs.resolve(tmp_path) == (effect, remarks)
         assert len(server.asked) == 1
     assert remarks == [f"{server.model} was asked what 'purple snow' means: snowfall, rgb (0.50, 0.00, 0.50), glitter 0.3"]
     assert effect.appearance.collided.rgb == (0.5, 0.0, 0.5) and effect.prompt == GOOD["prompt"]
@@ -327,11 +327,11 @@ def test_a_language_model_is_asked_once_and_said_to_have_been(protocol, tmp_path
 @pytest.mark.parametrize("turn", ["I cannot do that.", json.dumps(GOOD | {"size": 50}), 401, 500, b"hello"])
 def test_where_a_model_gives_no_usable_answer_the_reader_does_and_says_why(turn, tmp_path):
     with serving("openai", turn) as server:
-        knobs = Knobs(weather="purple snow", llm=server.model, llm_url=server.url)
-        effect, (remark, *_) = knobs.effect_asked(tmp_path)
+        knobs = EffectOptions(weather="purple snow", llm=server.model, llm_url=server.url)
+        effect, (remark, *_) = knobs.resolve(tmp_path)
         count = len(server.asked)
-        assert knobs.effect_asked(tmp_path)[0] == effect and len(server.asked) == count  # not asked in vain over and over
-    assert effect == Knobs(weather="purple snow").effect_asked()[0]
+        assert knobs.resolve(tmp_path)[0] == effect and len(server.asked) == count  # not asked in vain over and over
+    assert effect == EffectOptions(weather="purple snow").resolve()[0]
     assert ". The built-in reader answers instead: understood snow = snowfall; purple = colour" in remark
     assert KEY not in remark and "\n" not in remark
     assert list(tmp_path.iterdir()) == []
@@ -341,32 +341,36 @@ def test_where_a_model_gives_no_usable_answer_the_reader_does_and_says_why(turn,
 def test_without_network_or_key_the_run_goes_on(protocol, tmp_path, monkeypatch):  # noqa: F811
     with serving(protocol) as server:
         pass
-    knobs = Knobs(weather="purple snow", llm=server.model, llm_url=server.url)
-    assert "cannot be reached" in knobs.effect_asked(tmp_path)[1][0]
+    knobs = EffectOptions(weather="purple snow", llm=server.model, llm_url=server.url)
+    assert "cannot be reached" in knobs.resolve(tmp_path)[1][0]
     monkeypatch.delenv(f"{protocol.upper()}_API_KEY")
-    remark = replace(knobs, weather="green snow").effect_asked(tmp_path)[1][0]
+    remark = replace(knobs, weather="green snow").resolve(tmp_path)[1][0]
     assert "needs a key in the environment" in remark and "The built-in reader answers instead" in remark
 
 
 def test_without_the_library_the_run_goes_on_too(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "any_llm", None)
-    remark = Knobs(weather="purple snow", llm="openai:x").effect_asked(tmp_path)[1][0]
+    remark = EffectOptions(weather="purple snow", llm="openai:x").resolve(tmp_path)[1][0]
     assert "pip install 'pgsd-nerfstudio[llm]'. The built-in reader answers instead: understood snow" in remark
 
 
 def test_words_that_nobody_understands_are_refused_with_both_reasons(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "any_llm", None)
     with pytest.raises(ValueError, match=r"pip install .*\. The built-in reader was asked instead: 'bliss' names nothing"):
-        Knobs(weather="bliss", llm="openai:x").effect_asked(tmp_path)
+        EffectOptions(weather="bliss", llm="openai:x").resolve(tmp_path)
 
 
 @needs_library
-def test_a_preview_keeps_the_answer_beside_its_output(yard, tmp_path: Path, capsys):
+def test_a_preview_keeps_the_answer_in_the_cache_where_training_finds_it(yard, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "cache"))
     with serving("openai", json.dumps(GOOD)) as server:
         words = ["--load-scene", yard[0], "--data", yard[1], "--output", tmp_path / "v.mp4", "--views", 0, 99]
         words += ["--weather", "purple snow", "--llm", server.model, "--llm-url", server.url]
         assert run(["preview", *map(str, words)]) == 1  # for want of view 99
-    told = capsys.readouterr().err.splitlines()
-    assert told[0] == "asking openai:test-model what 'purple snow' means"
-    assert told[1].startswith("openai:test-model was asked what 'purple snow' means: snowfall, rgb")
-    assert [path.name[:5] for path in tmp_path.iterdir()] == ["request-"]
+        told = capsys.readouterr().err.splitlines()
+        assert told[0] == "asking openai:test-model what 'purple snow' means"
+        assert told[1].startswith("openai:test-model was asked what 'purple snow' means: snowfall, rgb")
+        words = EffectOptions(weather="purple snow", llm=server.model, llm_url=server.url)
+        asked = len(server.asked)
+        assert words.resolve()[0].prompt == GOOD["prompt"] and len(server.asked) == asked
+    assert [path.name[:8] for path in (tmp_path / "cache" / "requests").iterdir()] == ["request-"]

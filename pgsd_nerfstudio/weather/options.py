@@ -1,0 +1,140 @@
+"""Which scene, and how the motion of its weather is simulated: the options that every command and the Python API share.
+
+The text under each field is its --help. Commands that are given the same words simulate the same motion: the scene, the effect
+and the options here decide what is simulated and name the file in the cache.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from pgsd_nerfstudio.physics.clock import Clock
+
+FLAT = tyro.conf.arg(name="")
+"""Marks a group of options whose flags carry no prefix."""
+
+PARTICLES_CPU, PARTICLES_CUDA = 20_000, 100_000
+"""Most active particles at once, where nothing is asked for: what a roll-out and its pictures take in reasonable time."""
+MOST_SECONDS = 3600.0
+MOST_FRAMES = 200_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Which scene, and what it measures."""
+
+    load_scene: Path = tyro.MISSING
+    """The frozen scene: a splatfacto run folder, its config.yml, a .ckpt, a 3DGS .ply (with --data), or the word demo."""
+    data: Path | None = None
+    """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
+    metres_per_unit: float | None = None
+    """Length of one scene unit in metres; by default such that the cameras were held 1.5 m above the ground."""
+
+    def check(self) -> None:
+        """Refuse what can be refused without opening the scene.
+
+        Raises:
+            ValueError: there is no such scene or data, or the scale is not a positive number.
+        """
+        if str(self.load_scene) != "demo" and not self.load_scene.expanduser().exists():
+            raise ValueError(
+                f"no scene at {self.load_scene}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo"
+            )
+        if self.data is not None and not self.data.expanduser().exists():
+            raise ValueError(f"no data at {self.data}: expected nerfstudio's transforms.json or its folder")
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < math.inf:
+            raise ValueError(f"metres per scene unit must be a positive number, got {self.metres_per_unit:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """How the motion of a weather is simulated."""
+
+    seconds: float = 10.0
+    """Length of the weather in seconds."""
+    fps: float = 25.0
+    """Frames per second of the simulation and of what is shown of it; 25 as in the paper's videos."""
+    max_particles: int | None = None
+    """Most active particles at once, each standing for several real ones: bounds time and memory. By default 20,000.
+    With CUDA 100,000."""
+    physics: Literal["metric", "paper"] = "metric"
+    """metric is right in SI units; paper is the publication's solver and numbers (MPM throughout in a unit cube, no air),
+    to compare with."""
+    everything: tyro.conf.FlagConversionOff[bool] = False
+    """Simulate also the air that no training camera sees: costs time, and free camera paths see weather everywhere."""
+    collisions: tyro.conf.FlagConversionOff[bool] = True
+    """Whether particles meet the scene's surface; False: they fall through it (the paper's "w/o CH")."""
+    seed: Annotated[int, tyro.conf.arg(aliases=["--weather-seed"])] = 0
+    """Seed of the weather: another one is another snowfall of the same kind. (Training has a seed of its own,
+    --machine.seed.)"""
+
+    def check(self) -> None:
+        """Refuse values that cannot be simulated.
+
+        Raises:
+            ValueError: a value is out of its range; one sentence says which.
+        """
+        for name, most, unit in (("seconds", MOST_SECONDS, " s"), ("fps", 1000.0, ""), ("max_particles", math.inf, "")):
+            value = getattr(self, name)
+            flag = name.replace("_", "-")
+            if value is not None and not value > 0:
+                raise ValueError(f"--{flag} must be positive, got {value:g}{unit}")
+            if value is not None and not value <= most:
+                raise ValueError(f"--{flag} must be at most {most:g}{unit}, got {value:g}{unit}")
+        if self.seconds * self.fps > MOST_FRAMES:
+            raise ValueError(
+                f"--seconds {self.seconds:g} at --fps {self.fps:g} are {self.seconds * self.fps:,.0f} frames; at most "
+                f"{MOST_FRAMES:,} can be simulated"
+            )
+        if self.seed < 0:
+            raise ValueError(f"--seed must not be negative, got {self.seed}")
+
+    @property
+    def frames(self) -> int:
+        """Frames of the whole weather."""
+        return max(2, round(self.seconds * self.fps))
+
+    @property
+    def clock(self) -> Clock:
+        """The frames and how long each lasts."""
+        from pgsd_nerfstudio.physics.clock import Clock
+
+        return Clock(self.fps, self.frames)
+
+    @property
+    def particles(self) -> int:
+        """Most active particles at once: as asked for, else what this machine affords."""
+        return self.max_particles or (PARTICLES_CUDA if _has_cuda() else PARTICLES_CPU)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnswerOptions:
+    """How the frozen scene answers the weather."""
+
+    edited_images: Path | None = None
+    """Folder of training views as an image editor shows them under this weather, named as the originals are.
+    The scene's look is fitted to them (1000 iterations, as in the paper; cached). By default it follows from geometry."""
+
+    def check(self) -> None:
+        """Refuse a folder that is not there.
+
+        Raises:
+            ValueError: there is no such folder.
+        """
+        if self.edited_images is not None and not self.edited_images.is_dir():
+            raise ValueError(f"--edited-images must be a folder of edited training views, found none at {self.edited_images}")
+
+
+def _has_cuda() -> bool:
+    if importlib.util.find_spec("torch") is None:
+        return False
+    import torch
+
+    return torch.cuda.is_available()

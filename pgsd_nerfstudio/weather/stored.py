@@ -1,0 +1,113 @@
+"""A weather in a folder: motion, answer, effect and options as files that anyone can read.
+
+The metric frame is stored with the motion: trajectories are in metres, and where the ground lies must not change with a later
+version's way of estimating it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from pgsd_nerfstudio import __version__
+from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.response.prepare import save_answer, stored_answer
+from pgsd_nerfstudio.scene.frame import Frame
+from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.storage import content_key
+from pgsd_nerfstudio.weather.making import assemble_weather
+from pgsd_nerfstudio.weather.options import SimulationOptions
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
+from pgsd_nerfstudio.weather.weather import Weather
+
+MOTION_FILE, ANSWER_FILE, DESCRIPTION_FILE = "motion_prior.safetensors", "answer.safetensors", "weather.json"
+
+
+class StoredWeatherError(ValueError):
+    """A stored weather that cannot be opened: which file is wrong, and how."""
+
+
+def save_weather(weather: Weather, folder: Path) -> Path:
+    """Write a weather into a folder, which is made if need be; returns it.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    scene = weather.scene
+    made_for = {"splat": _splat_key(scene), "frame": _plain(scene.frame)}
+    history = replace(weather.history, about={**weather.history.about, **made_for})
+    folder.mkdir(parents=True, exist_ok=True)
+    history.save(folder / MOTION_FILE)
+    save_answer(folder / ANSWER_FILE, weather.answer)
+    description = {"version": __version__, "effect": asdict(weather.effect), "options": asdict(weather.options)}
+    beside = folder / f".{DESCRIPTION_FILE}.{os.getpid()}"
+    beside.write_text(json.dumps(description, indent=1, ensure_ascii=False) + "\n", "utf-8")
+    beside.replace(folder / DESCRIPTION_FILE)
+    return folder
+
+
+def open_weather(prepared: PreparedScene, folder: Path) -> Weather:
+    """The weather of a folder, on the device of the prepared scene and in the metric frame in which it was made.
+
+    Args:
+        prepared: the scene for which it was made; its own metric frame is replaced by the stored one.
+        folder: of `save_weather`.
+
+    Raises:
+        StoredWeatherError: a file is missing, damaged or of another version, or the scene is another one.
+    """
+    effect, options = _description(folder / DESCRIPTION_FILE)
+    motion = folder / MOTION_FILE
+    history = ParticleHistory.load(motion)
+    if history is None or not {"splat", "frame"} <= set(history.about):
+        raise StoredWeatherError(f"the motion prior {motion} is missing or damaged")
+    if history.about["splat"] != _splat_key(prepared.scene):
+        raise StoredWeatherError(
+            f"this is not the scene for which {folder} was made: its Gaussians or cameras have changed; put the former one back"
+        )
+    prepared = replace(prepared, scene=replace(prepared.scene, frame=_frame(history.about["frame"])))
+    kept = folder / ANSWER_FILE
+    answer = stored_answer(kept, prepared.scene, effect, seconds=options.seconds, seed=options.seed)
+    if answer is None:
+        raise StoredWeatherError(f"the scene's answer {kept} is missing or damaged")
+    return assemble_weather(prepared, effect, options, history.to(prepared.device), answer.to(prepared.device))
+
+
+def _description(path: Path) -> tuple[Effect, SimulationOptions]:
+    try:
+        stored = json.loads(path.read_text("utf-8"))
+        version = str(stored["version"])
+        if version.split(".")[:2] != __version__.split(".")[:2]:
+            raise StoredWeatherError(
+                f"{path} was written by pgsd_nerfstudio {version}, installed is {__version__}: make it again"
+            )
+        effect = TypeAdapter(Effect).validate_python(stored["effect"])
+        options = TypeAdapter(SimulationOptions).validate_python(stored["options"])
+    except (OSError, ValidationError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise StoredWeatherError(f"the description {path} of the weather is missing or damaged") from error
+    return effect, options
+
+
+def _splat_key(scene: Scene) -> str:
+    return content_key(scene.gaussians, scene.cameras)
+
+
+def _plain(frame: Frame) -> dict[str, Any]:
+    return {
+        "metres_per_unit": frame.metres_per_unit,
+        "rotation": frame.rotation.tolist(),
+        "origin": frame.origin.tolist(),
+        "source": frame.source,
+    }
+
+
+def _frame(plain: dict[str, Any]) -> Frame:
+    rotation, origin = torch.tensor(plain["rotation"]), torch.tensor(plain["origin"])
+    return Frame(plain["metres_per_unit"], rotation, origin, plain["source"])

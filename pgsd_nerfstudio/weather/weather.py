@@ -1,0 +1,172 @@
+"""The weather of a scene: moving particles and the scene's answer, rendered from any camera at any second."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
+from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.physics.record.report import report
+from pgsd_nerfstudio.response.answer import Answer, Shown
+from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.weather.options import SimulationOptions
+from pgsd_nerfstudio.weather.picture import Picture, picture_of
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
+
+
+@dataclass(frozen=True, eq=False)
+class Weather:
+    """One weather in one scene. Frame f shows the second f / fps; seconds count from the beginning of the weather."""
+
+    prepared: PreparedScene
+    effect: Effect
+    options: SimulationOptions
+    history: ParticleHistory
+    """The simulated motion, in metres of the metric frame (z up, ground at z = 0)."""
+    answer: Answer
+    """How the frozen scene looks under the weather."""
+    sequence: GaussianSequence
+    """What is shown of the motion: as simulated, or with what training has learned."""
+
+    @property
+    def scene(self) -> Scene:
+        """The frozen scene."""
+        return self.prepared.scene
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the weather."""
+        return self.history.frames
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.history.fps
+
+    def frame_at(self, second: float) -> int:
+        """The frame that is nearest to a second.
+
+        Raises:
+            ValueError: the second lies before the beginning or after the end of the weather.
+        """
+        end = self.frame_count / self.fps
+        if not 0.0 <= second <= end:
+            raise ValueError(f"this weather lasts from second 0 to {end:g}, asked for {second:g}")
+        return min(round(second * self.fps), self.frame_count - 1)
+
+    def positions(self, second: float) -> Float[Tensor, "n 3"]:
+        """Where the particles are, in metres of the metric frame: the active ones, then the collided ones.
+
+        Raises:
+            ValueError: the second is outside of the weather.
+        """
+        return self.sequence.gaussians(self.frame_at(second)).means
+
+    def gaussians(self, frame: int) -> Gaussians:
+        """The particles of a frame as Gaussians in scene units with plain RGB: the active ones, then the collided ones.
+
+        Raises:
+            IndexError: there is no such frame.
+        """
+        with torch.no_grad():
+            return self.scene.frame.gaussians_to_scene(self.sequence.gaussians(frame))
+
+    def moment(self, frame: int) -> Shown | None:
+        """The answer of the frozen scene at a frame; None where it still looks as it was trained."""
+        return self.answer.at(frame / self.fps)
+
+    def render(self, camera: Cameras, second: float) -> Picture:
+        """What a camera sees at a second.
+
+        Args:
+            camera: one camera in scene units, such as `scene.cameras[0]` (`.resized(width, height)` for another size).
+            second: seconds since the beginning of the weather.
+
+        Raises:
+            ValueError: the second is outside of the weather, or there is not exactly one camera.
+        """
+        return self.render_frame(camera, self.frame_at(second))
+
+    def render_frame(self, camera: Cameras, frame: int) -> Picture:
+        """What a camera sees at a frame, as `render`.
+
+        Raises:
+            IndexError: there is no such frame.
+            ValueError: there is not exactly one camera.
+        """
+        return picture_of(self.prepared, camera, self.gaussians(frame), self.moment(frame))
+
+    def render_clear(self, camera: Cameras) -> Picture:
+        """What a camera sees of the scene without the weather, as it was trained.
+
+        Raises:
+            ValueError: there is not exactly one camera.
+        """
+        return picture_of(self.prepared, camera, None, None)
+
+    def frames(self, cameras: Cameras, start: float = 0.0) -> Iterator[Picture]:
+        """One picture for each camera, at frames that follow each other.
+
+        Args:
+            cameras: a camera path at the weather's frames per second.
+            start: second of the first picture.
+
+        Raises:
+            ValueError: the path leaves the weather.
+        """
+        first = self.frame_at(start)
+        if first + len(cameras) > self.frame_count:
+            raise ValueError(
+                f"{len(cameras)} pictures from second {start:g} need {first + len(cameras)} frames, "
+                f"this weather has {self.frame_count}"
+            )
+        return (self.render_frame(cameras[k], first + k) for k in range(len(cameras)))
+
+    def report(self) -> dict[str, object]:
+        """Counts, masses, momentum and energy by frame, as plain values for JSON; see physics.record.report."""
+        return report(self.history, self.effect.material)
+
+    def shown_by(self, sequence: GaussianSequence) -> Weather:
+        """The same weather with another motion and look, such as a trained one."""
+        return replace(self, sequence=sequence)
+
+    def save(self, folder: str | Path) -> Path:
+        """Keep the weather in a folder: motion, answer, effect and options; the scene itself stays where it is.
+
+        What training has learned is not in it; a run of ns-train keeps that.
+
+        Returns:
+            The folder.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        from pgsd_nerfstudio.weather.stored import save_weather
+
+        return save_weather(self, Path(folder))
+
+    @staticmethod
+    def open(folder: str | Path, scene: Scene, device: torch.device | str | None = None) -> Weather:
+        """The weather that `save` kept, in the metric frame in which it was made; nothing is simulated.
+
+        Args:
+            folder: of `save`, or of a run of ns-train (then without what it has learned).
+            scene: the scene for which it was made.
+            device: cpu or cuda; by default cuda where there is one.
+
+        Raises:
+            ValueError: a file is missing or damaged, of another version, or the scene is another one.
+        """
+        from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
+        from pgsd_nerfstudio.weather.stored import open_weather
+
+        return open_weather(prepare_scene(scene, device), Path(folder))

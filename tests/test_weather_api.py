@@ -1,0 +1,191 @@
+"""The Python API: one way to make the weather of a scene, the same weather as that of the commands, quick to import."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plugin_scene import tiny_config, train, write_scene
+
+import pgsd_nerfstudio
+from pgsd_nerfstudio.cli.main import run
+from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
+from pgsd_nerfstudio.weather.options import SimulationOptions
+from pgsd_nerfstudio.weather.stored import StoredWeatherError
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory):
+    ply = write_scene(tmp_path_factory.mktemp("scene"))
+    return pgsd_nerfstudio.load_scene(ply, data=ply.parent)
+
+
+@pytest.fixture(scope="module")
+def weather(scene):
+    snow = pgsd_nerfstudio.effect("snowfall", intensity=3.0)
+    return pgsd_nerfstudio.simulate(scene, snow, seconds=1.0, max_particles=300, progress=False)
+
+
+def test_every_public_name_is_there_and_documented():
+    for name in pgsd_nerfstudio.__all__:
+        found = getattr(pgsd_nerfstudio, name)
+        assert name == "__version__" or (found.__doc__ and found.__doc__[0].isupper()), name
+    assert dir(pgsd_nerfstudio) == sorted(pgsd_nerfstudio.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'snow'"):
+        _ = pgsd_nerfstudio.snow
+
+
+def test_importing_is_quick_and_brings_neither_torch_nor_nerfstudio():
+    program = (
+        "import sys, time; began = time.process_time(); import pgsd_nerfstudio; spent = time.process_time() - began;"
+        "print(spent, {'torch', 'numba', 'nerfstudio', 'taichi', 'numpy'} & {*sys.modules})"
+    )
+    seconds, heavy = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split(
+        " ", 1
+    )
+    assert heavy.strip() == "set()" and float(seconds) < 0.3
+
+
+def test_weather_is_made_and_rendered_without_nerfstudio(tmp_path: Path):
+    ply = write_scene(tmp_path)
+    program = f"""
+import sys, pgsd_nerfstudio
+scene = pgsd_nerfstudio.load_scene({str(ply)!r}, data={str(ply.parent)!r})
+weather = pgsd_nerfstudio.simulate(scene, "rainfall", seconds=0.4, max_particles=50, progress=False)
+weather.render(scene.cameras[0], second=0.2).save({str(tmp_path / "a.png")!r})
+print("nerfstudio" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip() == "False"
+    assert np.asarray(Image.open(tmp_path / "a.png")).shape == (32, 48, 3)
+
+
+def test_a_picture_has_colours_depth_and_accumulation(scene, weather):
+    camera = scene.cameras[0]
+    picture, clear = weather.render(camera, second=0.9), weather.render_clear(camera)
+    size = (camera.height, camera.width)
+    assert (picture.rgb.shape, picture.depth.shape, picture.accumulation.shape) == ((*size, 3), size, size)
+    assert float((picture.rgb - clear.rgb).abs().mean()) > 0.01, "there is weather in it"
+    centre = clear.depth[camera.height // 2, camera.width // 2]
+    away = float((scene.cameras.centers[0] - torch.tensor([0.0, 0.0, 0.4])).norm())
+    assert abs(float(centre) - away) < 0.6, "the table stands where the camera looks"
+
+
+def test_seconds_outside_of_the_weather_are_refused(scene, weather):
+    for second in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match=r"this weather lasts from second 0 to 1, asked for"):
+            weather.render(scene.cameras[0], second=second)
+    assert weather.frame_at(0.0) == 0 and weather.frame_at(1.0) == 24 and weather.frame_at(0.21) == 5
+    with pytest.raises(ValueError, match="seen by one camera, got 6"):
+        weather.render(scene.cameras, second=0.5)
+    with pytest.raises(ValueError, match=r"6 pictures from second 0.9 need 28 frames, this weather has 25"):
+        weather.frames(scene.cameras, start=0.9)
+
+
+def test_positions_are_those_of_the_simulation_in_metres(weather):
+    history, frame = weather.history, weather.frame_at(0.6)
+    active, resting = history.active(frame), history.resting(frame)
+    expected = torch.cat([history.positions_at(frame, active), history.rest_positions[resting]])
+    assert torch.equal(weather.positions(0.6), expected)
+    # The Gaussians that are drawn are the same, in scene units.
+    torch.testing.assert_close(weather.scene.frame.to_metric(weather.gaussians(frame).means), expected, atol=1e-5, rtol=0)
+
+
+def test_a_path_becomes_a_video(scene, weather, tmp_path: Path):
+    path = pgsd_nerfstudio.slow_path(scene, frames=5, fps=weather.fps, views=(0, 1)).resized(48, 32)
+    pictures = list(weather.frames(path, start=0.4))
+    assert torch.equal(pictures[2].rgb, weather.render_frame(path[2], 12).rgb)
+    pgsd_nerfstudio.write_video(tmp_path / "a.mp4", (picture.rgb for picture in pictures), weather.fps)
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4"))[0] == 5
+    with pytest.raises(ValueError, match="views must lie in 0-5"):
+        pgsd_nerfstudio.slow_path(scene, frames=5, views=(0, 6))
+
+
+def test_a_stored_weather_comes_back_to_the_bit(scene, weather, tmp_path: Path):
+    assert weather.save(tmp_path / "kept") == tmp_path / "kept"
+    back = pgsd_nerfstudio.Weather.open(tmp_path / "kept", scene)
+    assert (back.effect, back.options) == (weather.effect, weather.options)
+    camera = scene.cameras[1]
+    for ours, theirs in zip(weather.render(camera, second=0.8), back.render(camera, second=0.8), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda folder: (folder / "motion_prior.safetensors").unlink(), "the motion prior .* is missing or damaged"),
+        (lambda folder: (folder / "answer.safetensors").write_bytes(b"no"), "the scene's answer .* is missing or damaged"),
+        (lambda folder: (folder / "weather.json").write_text("{}"), "the description .* is missing or damaged"),
+        (lambda folder: _older(folder / "weather.json"), r"was written by pgsd_nerfstudio 0\.0\.9, installed is"),
+    ],
+)
+def test_what_is_missing_of_a_stored_weather_is_said(scene, weather, tmp_path: Path, spoil, sentence):
+    folder = weather.save(tmp_path)
+    spoil(folder)
+    with pytest.raises(StoredWeatherError, match=sentence):
+        pgsd_nerfstudio.Weather.open(folder, scene)
+
+
+def _older(path: Path) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"version": "0.0.9"}))
+
+
+def test_a_stored_weather_of_another_scene_is_refused(weather, tmp_path: Path):
+    other = write_scene(tmp_path, table=0.7)
+    with pytest.raises(StoredWeatherError, match="is not the scene for which"):
+        pgsd_nerfstudio.Weather.open(weather.save(tmp_path / "kept"), pgsd_nerfstudio.load_scene(other, data=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"seconds": 0}, "--seconds must be positive, got 0 s"),
+        ({"seconds": float("inf")}, "--seconds must be at most 3600 s, got inf s"),
+        ({"fps": float("nan")}, "--fps must be positive, got nan"),
+        ({"max_particles": 0}, "--max-particles must be positive, got 0"),
+        ({"seconds": 3000, "fps": 1000}, "are 3,000,000 frames; at most 200,000 can be simulated"),
+        ({"seed": -1}, "--seed must not be negative, got -1"),
+    ],
+)
+def test_one_judge_of_simulation_options(options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        SimulationOptions(**options).check()
+
+
+def test_the_same_words_are_simulated_once_by_preview_simulate_training_and_python(tmp_path: Path, monkeypatch, capsys):
+    """`pgsd preview`, then `pgsd simulate`, then two steps of training, then Python: one simulation in all."""
+    monkeypatch.setenv("PGSD_CACHE", str(tmp_path / "cache"))
+    module = importlib.import_module("pgsd_nerfstudio.physics.motion_prior")
+    simulated, simulate = [], module.simulate_metric
+
+    def counted(*arguments, **named):
+        simulated.append(named["max_particles"])
+        return simulate(*arguments, **named)
+
+    monkeypatch.setattr(module, "simulate_metric", counted)
+    ply = write_scene(tmp_path)
+    words = ["--load-scene", str(ply), "--data", str(tmp_path), "--intensity", "3", "--seconds", "0.8", "--seed", "5"]
+    small = ["--frames", "2", "--width", "48", "--height", "32"]
+    assert run(["preview", *words, *small, "--output", str(tmp_path / "a.mp4")]) == 0
+    assert run(["simulate", *words, "--output", str(tmp_path / "report")]) == 0
+    prior = write_tiny(tmp_path / "prior")
+    asked = {"intensity": 3.0, "seconds": 0.8, "seed": 5, "max_particles": None, "steps": 2}
+    config = train(tiny_config(ply, prior, tmp_path / "outputs", **asked))
+    assert (config.parent / "motion_prior.safetensors").is_file()
+    scene = pgsd_nerfstudio.load_scene(ply, data=tmp_path)
+    snow = pgsd_nerfstudio.effect("snowfall", intensity=3.0)
+    weather = pgsd_nerfstudio.simulate(scene, snow, seconds=0.8, seed=5, progress=False)
+    assert simulated == [SimulationOptions().particles]
+    assert "other" in run_with_another_seed(words, small, tmp_path) and len(simulated) == 2
+    # A run of ns-train holds the weather as Python knows it.
+    assert torch.equal(pgsd_nerfstudio.Weather.open(config.parent, scene).positions(0.5), weather.positions(0.5))
+
+
+def run_with_another_seed(words: list[str], small: list[str], folder: Path) -> str:
+    assert run(["preview", *words[:-1], "6", *small, "--output", str(folder / "other.mp4")]) == 0
+    return "other"
