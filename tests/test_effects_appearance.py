@@ -79,7 +79,7 @@ def test_no_patch_hangs_over_an_edge(look):
     assert (look.collided.scales[:, 2] <= 0.5 * look.collided.scales[:, :2].amin(1) + 1e-6).all()
 
 
-def test_a_landed_flake_spreads_from_its_flake_to_its_patch(look):
+def test_a_collided_flake_spreads_from_its_flake_to_its_patch(look):
     ids = torch.arange(2000)
     seconds = SNOWFALL.appearance.collided.settle_seconds
     first, middle, last = (look.collided_at(Landed(), f, ids) for f in (10, 10 + int(12.5 * seconds), 10 + int(25 * seconds)))

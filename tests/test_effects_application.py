@@ -1,7 +1,7 @@
-"""A request turns the knobs that it names by the factors that it says; every request gives an effect that can be simulated.
+"""A request changes the numbers that it names by its factors, and every request gives an effect that can be simulated.
 
-Judges: physics.populations for counts, water and fall speeds (Gunn & Marshall, Locatelli & Hobbs, Koschmieder); what a particle
-looks like from `initial_look`; the refusals of Emission for what it allows.
+References: physics.laws.populations for counts, water and fall speeds (Gunn & Marshall, Locatelli & Hobbs, Koschmieder),
+`initial_look` for the look of particles, and the errors of Emission for the intensities that it allows.
 """
 
 from __future__ import annotations
@@ -138,14 +138,14 @@ TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("base", "said", "expected"), TURNED)
-def test_each_word_of_a_wish_turns_its_own_knobs_and_no_others(base, said, expected):
+def test_each_field_of_a_request_changes_its_own_numbers_and_no_others(base, said, expected):
     effect = applied(request(base.name, **said))
     assert changes(effect, base) == expected
     assert (effect.name, effect.prompt) == (base.name, PROMPT)
     assert EFFECTS[base.name] is base
 
 
-def test_a_wish_without_a_base_is_for_snow_and_a_given_base_comes_first():
+def test_a_request_without_a_base_is_for_snow_and_a_given_base_comes_first():
     assert applied(request(None)).emission == SNOWFALL.emission
     heavier = replace(RAINFALL, emission=replace(RAINFALL.emission, intensity=20.0))
     assert applied(request("fog", amount=2.0), base=heavier).emission.intensity == 40.0

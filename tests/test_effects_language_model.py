@@ -127,7 +127,7 @@ def asked(server: Server, folder: Path, prompt: str = "purple snow", timeout: fl
 
 
 @needs_library
-def test_a_good_answer_is_the_wish_and_the_question_follows_the_protocol(protocol, tmp_path):
+def test_a_good_answer_is_the_request_and_the_question_follows_the_protocol(protocol, tmp_path):
     with serving(protocol, json.dumps(GOOD)) as server:
         assert asked(server, tmp_path) == REQUEST
     request = server.asked[0]

@@ -1,6 +1,6 @@
-"""A request says only what its limits allow, and the reader finds in a text what a person finds in it.
+"""A request stays within its limits, and the reader finds in a text what a person finds in it.
 
-Judges: jsonschema for what a request may say; for colours the names of CSS, the XKCD survey and CIE L*a*b* distances; for
+References: jsonschema for the fields of a request; for colours the names of CSS, the XKCD survey and CIE L*a*b* distances; for
 mixtures the transfer function of sRGB (IEC 61966-2-1); for amounts and winds the order of the meteorologists' classes.
 """
 
@@ -94,7 +94,7 @@ def test_numbers_that_are_none_are_refused(number):
         Request.from_json(f'{{"base": "fog", "prompt": "in {{scene}}", "glitter": {number}}}')
 
 
-def test_a_wish_is_plain_frozen_and_cannot_be_turned_out_of_its_limits():
+def test_a_request_is_plain_frozen_and_cannot_leave_its_limits():
     request = Request(**LEAST)
     assert is_dataclass(request)
     with pytest.raises(FrozenInstanceError):

@@ -1,4 +1,4 @@
-"""Coating and water over time against closed forms and an integrator of ordinary differential equations."""
+"""Cover and water over time against closed forms and an integrator of ordinary differential equations."""
 
 import math
 from dataclasses import replace
@@ -34,7 +34,7 @@ def test_open_ground_gets_the_precipitation_of_the_time_lapse():
     assert layers(snow).thickness(10.0).mean() == pytest.approx(expected, rel=0.04)
 
 
-def test_a_layer_never_shrinks_and_hides_more_and_more():
+def test_a_cover_never_shrinks_and_hides_more_and_more():
     lying = layers(effect("snowfall"))
     shares = torch.stack([lying.hidden(t) for t in torch.linspace(0, 12, 30).tolist()])
     assert (shares.diff(dim=0) >= 0).all() and shares[0].max() == 0 and shares[-1].mean() > 0.8 and shares.max() <= 1
@@ -87,7 +87,7 @@ def test_fallen_is_the_integral_of_the_share(timeline: Timeline):
         assert timeline.fallen(seconds) == pytest.approx(rate, abs=1e-6)
 
 
-def test_a_spell_is_refused_that_ends_before_it_came():
+def test_a_timeline_that_ends_before_its_onset_is_refused():
     with pytest.raises(ValueError, match="cannot end at 2 s"):
         Timeline(onset=3.0, ends=2.0)
     with pytest.raises(ValueError, match="onset"):

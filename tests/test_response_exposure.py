@@ -1,4 +1,4 @@
-"""What reaches a surface and what sky it sees, against view factors and the geometry of slanted rain."""
+"""Caught mass and share of the sky against view factors and the geometry of slanted rain."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The air of each weather takes what was measured of light, drifts with the wind and comes as its timeline says."""
+"""The haze of each weather has the measured extinction, drifts with the wind and follows the timeline."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wet and tinted colours against Fresnel's equations, an inverse, and what must not change."""
+"""Wet and tinted colours against Fresnel's equations, an inverse, and invariants."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What is costly of an answer is computed once; what comes from a file is what was computed."""
+"""The costly parts of an answer are computed once, and a stored answer equals the computed one."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""Metres and up: known ones are found again, wherever and however the scene lies in its own coordinates."""
+"""The metric frame: known scale and up are found again, whatever the position and orientation of the scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every form of a scene leads to the same scene, and every unusable one to one sentence."""
+"""Every kind of file gives the same scene, and every unusable one gives one sentence."""
 
 from __future__ import annotations
 

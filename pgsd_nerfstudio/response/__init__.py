@@ -1,1 +1,1 @@
-"""ANSWERS: how the frozen scene looks under the weather, as a function of Gaussians and time."""
+"""The answer of the frozen scene: how it looks under the weather, as a function of its Gaussians and of time."""

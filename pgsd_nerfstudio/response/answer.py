@@ -1,7 +1,7 @@
-"""The frozen scene's answer to a weather: what a camera sees of it at a second, as a function of its Gaussians and of time.
+"""The answer of the frozen scene to a weather: the change of its look, as a function of its Gaussians and of time.
 
-Its own tensors are never changed. In order: edited pictures, where there are some; the light of the weather on what is there;
-water that darkens and mirrors; the layer that hides; the air in between.
+The tensors of the scene are never changed. The changes apply in this order: edited pictures if there are some, the light of the
+weather, water that darkens and mirrors, the cover that hides, the haze between camera and surface.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.response.edits import Edits
     from pgsd_nerfstudio.response.haze_field import HazeField
 
-FAR = 3000.0  # m: where the sky begins, as far as haze is concerned
-OPAQUE_UNDER = 1.5  # a full layer is as opaque as this many more Gaussians in the same place
-WIDER_UNDER = 0.25  # and by so much wider, to close the gaps between blades and stones
-BLUE_SHADOWS = 0.45  # exponent of the softening with which shadows lose colour
+FAR = 3000.0  # m; distance of the sky for the haze
+OPAQUE_UNDER = 1.5  # a full cover adds the opacity of this many more Gaussians in the same place
+WIDER_UNDER = 0.25  # relative increase of the scales under a full cover, which closes the gaps between blades and stones
+BLUE_SHADOWS = 0.45  # exponent of the softening by which shadows lose colour
 MIDDLE = 0.18  # linear light of a middle grey
-RELIEF = 0.22  # share of a layer's light that follows the light of what it lies on: its folds are not filled at once
+RELIEF = 0.22  # share of a cover's light that follows the light of the surface below, whose folds are not filled at once
 WAXEN = 0.75  # share of a wet look that leaves do not take on
-SMOOTH = 0.45  # share of what a level film of water would mirror that rough ground does
+SMOOTH = 0.45  # light that wet level ground mirrors, relative to a level film of water
 
 _numbers = itertools.count()
 R = TypeVar("R")
@@ -44,31 +44,32 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """N frozen Gaussians in a weather; all tensors on one device."""
+    """The change of N frozen Gaussians under a weather; all tensors are on one device."""
 
     effect: Effect
     exposure: Exposure
     coating: Coating
     softening: Float[Tensor, " n"] | None
-    """Factor on linear light when all of the ambience's clouds have come; None where no sun was found."""
+    """Factor on linear light in full weather, when clouds soften the shadows; None if no sun was found."""
     up: Float[Tensor, "3 3"]
     """Scene axes to metric axes."""
     metres_per_unit: float
     haze: HazeField | None = None
     edits: Edits | None = None
     seconds: float = 10.0
-    """When edited pictures are reached in full."""
+    """Second at which the edited pictures are reached in full."""
     number: int = field(default_factory=lambda: next(_numbers))
+    """Number of this object in the process, by which caches tell answers apart."""
 
     def at(self, seconds: float) -> Shown | None:
-        """What is seen at a second; None where the scene is still as it was, to the bit."""
+        """The answer at a second; None if it changes no bit of the scene."""
         medium = self.haze.at(seconds) if self.haze is not None else None
         hidden, wet = self.coating.hidden(seconds), self.coating.wet(seconds)
         shown = Shown(self, seconds, medium, hidden, wet)
         return shown if shown.changes else None
 
     def to(self, device: torch.device | str) -> Answer:
-        """The same on another device."""
+        """The same answer on another device."""
         return self._each(lambda tensor: tensor.to(device), up=self.up.to(device))
 
     def select(self, which: Tensor) -> Answer:
@@ -76,7 +77,7 @@ class Answer:
         return self._each(lambda tensor: tensor[which])
 
     def thicker(self, factor: float) -> Answer:
-        """The same weather with more haze, or less."""
+        """The same answer with the extinction of its haze multiplied by `factor`."""
         if self.haze is None or factor == 1.0:
             return self
         return replace(self, haze=replace(self.haze, extinction=self.haze.extinction * factor), number=next(_numbers))
@@ -93,7 +94,8 @@ class Answer:
         )
 
     def share_of_edits(self, seconds: float) -> Float[Tensor, " n"]:
-        """How far each Gaussian has gone towards the edited pictures: as its own layer has grown, elsewhere as the weather."""
+        """Share of the edits that each Gaussian shows, 0..1. It grows with the Gaussian's cover, or with the weather if it has
+        no cover."""
         final, now = self.coating.hidden(self.seconds), self.coating.hidden(seconds)
         timeline = self.effect.timeline
         overall = timeline.fallen(seconds) / max(timeline.fallen(self.seconds), 1e-9)
@@ -102,32 +104,35 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One moment, as a rasterizer asks for it (rendering.moment.Moment)."""
+    """The answer at one moment, in the form of rendering.moment.Moment."""
 
     answer: Answer
     seconds: float
     medium: Medium | None
     hidden: Float[Tensor, " n"]
+    """Share of each Gaussian that the cover hides, 0..1."""
     wet: Float[Tensor, " n"]
+    """Share of each Gaussian that is wet, 0..1."""
 
     @property
     def key(self) -> bytes:
+        """Name of this moment; moments with equal keys look the same."""
         return f"answer {self.answer.number} at {self.seconds:.6f}".encode()
 
     @property
     def changes(self) -> bool:
-        """Whether anything looks other than without weather."""
-        lies = bool((self.hidden > 0).any()) or bool((self.wet > 0).any())
+        """Whether the scene looks different from the frozen scene."""
+        coated = bool((self.hidden > 0).any()) or bool((self.wet > 0).any())
         lights = self.answer.effect.ambience is not None and self.share > 0
-        return lies or lights or self.medium is not None or (self.answer.edits is not None and self.seconds > 0)
+        return coated or lights or self.medium is not None or (self.answer.edits is not None and self.seconds > 0)
 
     @property
     def share(self) -> float:
-        """How much of the weather has come."""
+        """Share of the full weather, 0..1."""
         return self.answer.effect.timeline.share(self.seconds)
 
     def altered(self, frozen: Gaussians) -> Gaussians:
-        """Under a layer Gaussians are wider and more opaque; edited pictures say themselves what they are."""
+        """The frozen Gaussians with the edits; without edits they are wider and more opaque under a cover."""
         if self.answer.edits is not None:
             return self.answer.edits.applied(frozen, self.answer.share_of_edits(self.seconds))
         if not bool((self.hidden > 0).any()):
@@ -138,27 +143,47 @@ class Shown:
     def frozen_colors(
         self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], view: Viewpoint
     ) -> Float[Tensor, "m 3"]:
+        """Colours of frozen Gaussians as a view shows them.
+
+        Args:
+            rgb: sRGB from the direction of the view, without weather.
+            means: centres in scene units.
+            ids: indices of these Gaussians in the frozen scene.
+            view: the camera.
+        """
         towards = torch.nn.functional.normalize(view.center - means, dim=1) @ self.answer.up.T.to(means)
         return self.moving_colors(self.lit(rgb, ids, towards), means, view)
 
     def moving_colors(self, rgb: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], view: Viewpoint) -> Float[Tensor, "n 3"]:
+        """Colours of particles as a view shows them through the haze; arguments as for `frozen_colors`."""
         return rgb if self.medium is None else self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
 
     def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
+        """The background behind the haze.
+
+        Args:
+            own: sRGB of the background without weather.
+            view: the camera.
+
+        Returns:
+            One colour, or a picture [h, w, 3] if the haze is not the same everywhere.
+        """
         if self.medium is None:
             return own
         far = FAR / self.answer.metres_per_unit
         return self.medium.behind(own, view.viewmat, view.K, view.width, view.height, far)
 
     def lit(self, rgb: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
-        """Colours [m, 3] of frozen Gaussians in the light and under the matter of the moment, without air.
+        """Colours [m, 3] of frozen Gaussians with light, water and cover of the moment, without haze.
 
         Args:
-            towards: metric unit vectors to the camera; None: no mirror.
+            rgb: sRGB without weather.
+            ids: indices of these Gaussians in the frozen scene.
+            towards: metric unit vectors to the camera; None: wet surfaces mirror nothing.
         """
         effect, edited = self.answer.effect, self.answer.edits is not None
         light = linear(rgb)
-        # Edited pictures show light, water and layer in their own way; only what depends on the camera is added.
+        # Edited pictures already show light, water and cover; only the mirror, which depends on the camera, is added.
         if effect.ambience is not None and not edited:
             light = self._in_weather(light, ids, effect.ambience)
         if effect.surface.landing == "wets":
@@ -168,10 +193,10 @@ class Shown:
                 light = light + wet * self._mirror(ids, towards, effect.ambience or Ambience())
         if edited:
             return encoded(light)
-        return encoded(torch.lerp(light, self._layer(light, ids), self.hidden[ids, None].to(light)))
+        return encoded(torch.lerp(light, self._cover(light, ids), self.hidden[ids, None].to(light)))
 
-    def _layer(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
-        """Light of the layer on Gaussians."""
+    def _cover(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+        """Light of the cover, from the light of the Gaussians below it."""
         relief = 1 - RELIEF + RELIEF * (luminance(under)[:, None] / MIDDLE).clamp_max(1.5)
         own = linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
         return own * relief * under_sky(self.answer.exposure.sky[ids].to(under))
@@ -183,7 +208,7 @@ class Shown:
         if self.answer.softening is None:
             return light
         softened = 1 + share * (self.answer.softening[ids, None].to(light) - 1)
-        # Shadows are lit by the blue of the sky alone, clouds are white.
+        # Shadows in the scene are lit by the blue sky alone, but clouds are white.
         grey = luminance(light)[:, None]
         return softened * torch.lerp(grey, light, softened.clamp_min(1.0) ** -BLUE_SHADOWS)
 
@@ -196,13 +221,18 @@ class Shown:
 
 
 def _mapped(record: R, change: Callable[[Tensor], Tensor]) -> R:
-    """A dataclass with all of its tensors changed."""
+    """A copy of a dataclass with `change` applied to its tensors."""
     found = {f.name: getattr(record, f.name) for f in fields(record)}  # type: ignore[arg-type]
     return replace(record, **{name: change(value) for name, value in found.items() if isinstance(value, Tensor)})  # type: ignore[type-var]
 
 
 def baked(shown: Shown | None, frozen: Gaussians) -> Gaussians:
-    """The frozen scene of a moment as a set of its own, for files: without mirror and air, which depend on the camera."""
+    """The frozen scene at a moment as a set of Gaussians for files, without mirror and haze, which depend on the camera.
+
+    Args:
+        shown: the answer at the moment; None: no change.
+        frozen: the frozen scene, with spherical harmonics.
+    """
     if shown is None:
         return frozen
     frozen = shown.altered(frozen)

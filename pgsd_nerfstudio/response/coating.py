@@ -1,9 +1,10 @@
-"""What lies on the frozen scene by a second of the weather: a layer of snow or sand that hides it, water that wets it.
+"""The coating of the frozen scene: cover (snow, sand) and wetness (water) on each Gaussian, as functions of time.
 
-Layer: what comes down and is caught (`exposure`), in the time lapse of the effect; no more than its film where it is steeper
-than its angle of repose, nothing where it does not hold. Water: dw/dt = rain - w / tau, the balance of `physics.wetness` for
-every place by itself. What shows is a share 1 - exp(-x / x0): of a layer thin on average some spots are bare, of a sprinkled
-surface some are dry (x0 of a layer: SurfaceResponse.hides, of water: SurfaceResponse.darkens).
+The cover grows by the falling mass that each Gaussian catches (`exposure`), in the time lapse of the effect. It stays a film on
+slopes above the angle of repose, and nothing stays where the slope does not hold it. The water follows dw/dt = rain - w / tau,
+the balance of `physics.ground.wetness`, at every place by itself. The visible share is 1 - exp(-x / x0), since a thin cover
+leaves some spots bare and a light rain leaves some dry (x0 of the cover: SurfaceResponse.hides, of the water:
+SurfaceResponse.darkens).
 """
 
 from __future__ import annotations
@@ -22,29 +23,36 @@ from pgsd_nerfstudio.physics.ground.wetness import Wetting
 from pgsd_nerfstudio.physics.laws.populations import MM_PER_HOUR, fall_speed, integral, number_density
 from pgsd_nerfstudio.response.exposure import LOOSE_MOST, Exposure
 
-ROUGHNESS = 0.35  # standard deviation of the logarithm of what neighbours catch: no edge of a cover is a line
-PATCHES = (0.15, 1.5)  # m, wavelengths of that
-SHARPNESS = 1.6  # exponent of a layer's thickness: the first flakes fall between blades and stones and are not seen
-STEPS_PER_SECOND = 50  # of the water's balance; its time constant is minutes
+ROUGHNESS = 0.35  # standard deviation of the logarithm of the caught mass, so that no edge of a cover is a straight line
+PATCHES = (0.15, 1.5)  # m; shortest and longest wavelength of that variation
+SHARPNESS = 1.6  # exponent of the cover's thickness: the first flakes fall between blades and stones and are not seen
+STEPS_PER_SECOND = 50  # of the balance of water, whose time constant is minutes
 
 
 @dataclass(frozen=True)
 class Coating:
-    """What lies on N Gaussians; functions of time."""
+    """Cover and wetness of N Gaussians as functions of time."""
 
     thickness_rate: Float[Tensor, " n"]
-    """Metres per second of full weather, normal to the surface."""
+    """Growth of the cover in metres per second of full weather, normal to the surface."""
     thickest: Float[Tensor, " n"]
-    """Metres; where it is steep a film, elsewhere without bound."""
+    """Greatest thickness in metres: a film on steep Gaussians, infinite on the others."""
     most: Float[Tensor, " n"]
-    """Greatest share that can be hidden."""
+    """Greatest share of the Gaussian that a cover can hide, 0..1."""
     water_rate: Float[Tensor, " n"]
-    """kg/(m^2 s) of full rain."""
+    """Water in kg/(m^2 s) in full rain."""
     effect: Effect
 
     @staticmethod
     def of(effect: Effect, exposure: Exposure, metric: Float[Tensor, "n 3"], *, seed: int = 0) -> Coating:
-        """Of Gaussians at metric places; nothing accumulates or wets where the effect says so."""
+        """The coating of Gaussians under an effect.
+
+        Args:
+            effect: its surface response tells whether particles accumulate or wet.
+            exposure: of the same Gaussians.
+            metric: their centres in metres.
+            seed: of the variation from place to place.
+        """
         response = effect.surface
         rate = falling_mass(effect) * exposure.catches * _uneven(metric, seed)
         none = torch.zeros_like(rate)
@@ -62,24 +70,24 @@ class Coating:
         )
 
     def thickness(self, seconds: float) -> Float[Tensor, " n"]:
-        """Metres of layer by then."""
+        """Thickness of the cover in metres at a second."""
         return torch.minimum(self.thickness_rate * self.effect.timeline.fallen(seconds), self.thickest)
 
     def hidden(self, seconds: float) -> Float[Tensor, " n"]:
-        """Share of each Gaussian that the layer hides, 0..1."""
+        """Share of each Gaussian that the cover hides at a second, 0..1."""
         return self.most * -torch.expm1(-((self.thickness(seconds) / self.effect.surface.hides) ** SHARPNESS))
 
     def water(self, seconds: float) -> Float[Tensor, " n"]:
-        """kg of water on a square metre, which are mm."""
+        """Water in kg/m^2, which is mm, at a second."""
         return self.water_rate * rained(self.effect, seconds)
 
     def wet(self, seconds: float) -> Float[Tensor, " n"]:
-        """Share of each Gaussian that is wet, 0..1."""
+        """Share of each Gaussian that is wet at a second, 0..1."""
         return -torch.expm1(-self.water(seconds) / self.effect.surface.darkens)
 
 
 def falling_mass(effect: Effect) -> float:
-    """kg that come down on an open horizontal square metre in a second of full weather."""
+    """Mass in kg that falls on an open horizontal square metre in a second of full weather."""
     emission = effect.emission
     if emission.precipitates:
         return emission.intensity * MM_PER_HOUR
@@ -89,7 +97,10 @@ def falling_mass(effect: Effect) -> float:
 
 
 def rained(effect: Effect, seconds: float) -> float:
-    """Seconds of full rain that are still there: W with dW/dt = share of the timeline until it ends - W / tau, W(0) = 0."""
+    """Seconds of full rain whose water has not dried at a second.
+
+    It is W with dW/dt = s - W / tau and W(0) = 0, where s is the share of the timeline until its end and tau the drying time.
+    """
     tau, timeline = Wetting().drying_seconds, effect.timeline
     until = min(max(seconds, 0.0), timeline.ends)
     at = np.linspace(0.0, until, max(math.ceil(until * STEPS_PER_SECOND), 1) + 1)
@@ -98,7 +109,7 @@ def rained(effect: Effect, seconds: float) -> float:
 
 
 def _uneven(metric: Float[Tensor, "n 3"], seed: int) -> Float[Tensor, " n"]:
-    """Factors about 1 that vary smoothly from place to place and by a hair from one Gaussian to the next."""
+    """Factors with mean 1 that vary smoothly from place to place and slightly from one Gaussian to the next."""
     generator = torch.Generator().manual_seed(seed)
     shortest, longest = PATCHES
     waves = torch.nn.functional.normalize(torch.randn(24, 3, generator=generator), dim=1)

@@ -1,4 +1,4 @@
-"""A folder of training views as an image editor made them: which view each is of, and its pixels."""
+"""Read a folder of edited pictures: the view that each picture shows, and its pixels."""
 
 from __future__ import annotations
 
@@ -15,25 +15,32 @@ from torch import Tensor
 from pgsd_nerfstudio.scene.scene import Scene
 
 Picture = tuple[int, UInt8[Tensor, "h w 3"]]
-"""Index of the scene's camera, and what the editor made of its view."""
+"""Index of a view, and its edited picture."""
 
 console = Console(stderr=True, highlight=False)
 
 
 def read_edited(folder: Path, scene: Scene) -> list[Picture]:
-    """The edited pictures in a folder, in the order of the views they show and in the size of the cameras.
+    """Read the edited pictures in a folder.
 
-    A picture carries the name of its photograph, whatever the suffix (frame_00012.png for images/frame_00012.jpg); where the
-    scene has no photographs, the one number in its name is the index of the view. Pictures of any other size are stretched to
-    that of the camera. What belongs to no view is left out, with a note.
+    A picture has the name of its photograph with any suffix (frame_00012.png for images/frame_00012.jpg). If the scene has no
+    photographs, the only number in the name is the index of the view. Pictures of another size are stretched to that of the
+    cameras. Pictures that belong to no view are left out, and a note tells so.
+
+    Args:
+        folder: holds the pictures.
+        scene: its cameras are the views, its photographs give the names.
+
+    Returns:
+        Indices of views in ascending order and their pictures.
 
     Raises:
-        ValueError: there is no such folder, no picture in it belongs to a view, a picture cannot be read, or two show one view.
+        ValueError: the folder is missing, no picture in it belongs to a view, a picture cannot be read, or two show one view.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise ValueError(
-            f"edited pictures lie in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
+            f"edited pictures must be in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
         )
     kinds = Image.registered_extensions()
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in kinds and not p.name.startswith(".") and p.is_file())
@@ -62,7 +69,7 @@ def read_edited(folder: Path, scene: Scene) -> list[Picture]:
 
 
 def _view_of(stem: str, scene: Scene) -> int | None:
-    """The view that a picture's name stands for, None where it stands for none or for several."""
+    """The view that the name of a picture tells; None if it tells no view or several."""
     if scene.images:
         same = [index for index, path in enumerate(scene.images) if path.stem == stem]
     else:

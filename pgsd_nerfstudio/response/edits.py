@@ -1,4 +1,4 @@
-"""A change of the frozen scene, kept beside it: any share of it can be shown, and the scene's own tensors stay as they are."""
+"""Edits: a change of the frozen Gaussians that is stored apart from them, so that any share of it can be shown."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 @dataclass(frozen=True)
 class Edits:
-    """A change of n Gaussians; zero leaves them as they are."""
+    """A change of n Gaussians; zero changes nothing."""
 
     rgb: Float[Tensor, "n 3"]
-    """Added to plain RGB."""
+    """Summand of the colour in plain RGB."""
     logit: Float[Tensor, " n"]
-    """Added to the logit of the opacity."""
+    """Summand of the logit of the opacity."""
     log_scale: Float[Tensor, "n 3"]
-    """Added to the logarithms of the scales."""
+    """Summand of the logarithms of the scales."""
 
     def __post_init__(self) -> None:
         n = self.rgb.shape[0]
@@ -36,26 +36,31 @@ class Edits:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
+        """All tensors by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def to(self, device: torch.device | str) -> Edits:
         return Edits(**{name: tensor.to(device) for name, tensor in self.tensors.items()})
 
     def select(self, which: Tensor) -> Edits:
-        """The change of the chosen Gaussians, by mask or by index."""
+        """The edits of the chosen Gaussians, by mask or by index."""
         return Edits(**{name: tensor[which] for name, tensor in self.tensors.items()})
 
     def applied(self, gaussians: Gaussians, share: Float[Tensor, " n"] | float) -> Gaussians:
-        """The Gaussians with a share of the change, one for all or one for each; differentiable.
+        """The Gaussians with a share of the edits; differentiable.
 
-        Share 0 gives the same values bit for bit, share 1 the look that was fitted. Opacities change by their logits, scales
-        by their logarithms, so that neither leaves its range at any share.
+        Share 0 returns the same values bit for bit, share 1 the look that was fitted. Opacities change by their logits and
+        scales by their logarithms, so that both stay in their range at any share.
+
+        Args:
+            gaussians: as many as the edits have.
+            share: one for all, or one for each Gaussian.
 
         Raises:
-            ValueError: the change is one of another number of Gaussians, or the shares are.
+            ValueError: the number of Gaussians or of shares is not that of the edits.
         """
         if len(gaussians) != len(self):
-            raise ValueError(f"this change is one of {len(self):,} Gaussians, found {len(gaussians):,}")
+            raise ValueError(f"these edits are for {len(self):,} Gaussians, found {len(gaussians):,}")
         if not isinstance(share, Tensor):
             return gaussians if share == 0 else self._added(gaussians, share)
         if tuple(share.shape) != (len(self),):
@@ -77,13 +82,17 @@ class Edits:
         else:
             constant = gaussians.colors[:, :1] + (rgb * rows / SH_C0)[:, None]
             colors = torch.cat([constant, gaussians.colors[:, 1:]], dim=1)
-        # sigmoid(logit(o) + x) without logarithms: exact where x = 0, and where o is 0 or 1; 80 keeps the odds finite.
+        # This is sigmoid(logit(o) + x) without logarithms: exact if x is 0 and if o is 0 or 1. The bound 80 keeps odds finite.
         odds = (logit * share).clamp(-80, 80).exp()
         opacities = gaussians.opacities * odds / (1 + gaussians.opacities * (odds - 1))
         return replace(gaussians, colors=colors, opacities=opacities, scales=gaussians.scales * (log_scale * rows).exp())
 
     def save(self, path: Path, key: str) -> None:
-        """Write one safetensors file, atomically, marked with what it was made from (`edits_key`).
+        """Write one safetensors file, atomically.
+
+        Args:
+            path: the final name.
+            key: the `edits_key` of the fit, stored in the file.
 
         Raises:
             OSError: the file could not be written.
@@ -92,7 +101,7 @@ class Edits:
 
     @staticmethod
     def load(path: Path, key: str) -> Edits | None:
-        """A stored change; None where there is none, it is damaged, or was made from something else."""
+        """Read stored edits; arguments as for `save`. None if the file is missing or damaged, or has another key."""
         stored = load_tensors(path)
         if stored is None or stored[1].get("key") != key or set(stored[0]) != {f.name for f in fields(Edits)}:
             return None

@@ -1,9 +1,9 @@
-"""How much of what comes down reaches each Gaussian of the frozen scene, and how much of the sky it sees.
+"""The exposure of each frozen Gaussian: the falling mass that reaches it, and the share of the sky that it sees.
 
-Rays against the way that particles come tell what is sheltered; the mass that a surface catches is the flux density times the
-cosine to its normal, relative to what an open horizontal surface catches (as for wind-driven rain: Blocken & Carmeliet, "A
-review of wind-driven rain research in building science", 2004, section 2). Sky: the cosine-weighted share of the hemisphere
-about the normal that is open (ambient visibility).
+Rays against the motion of the particles find the sheltered Gaussians. The mass that a surface catches is the flux density times
+the cosine to its normal, relative to the catch of an open horizontal surface (as for wind-driven rain: Blocken & Carmeliet, "A
+review of wind-driven rain research in building science", 2004, section 2). The share of the sky is the cosine-weighted share of
+the hemisphere about the normal that is open (ambient visibility).
 """
 
 from __future__ import annotations
@@ -23,35 +23,43 @@ from pgsd_nerfstudio.response.rays import blocked, open_sky
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-RAYS = 24  # per Gaussian and kind; their noise, a tenth, is less than what neighbours differ by
-NEAR = 0.08  # m: a Gaussian this close to the surface is part of it
-SUNK = 0.5  # m below the ground to which Gaussians still belong to it: light leaks through the ones above
-OFF = 0.03  # m off the surface from which rays start: captures are rough by as much
-LOOSE_CATCH = 0.4  # leaves, blades and branches turn half of their area to the sky, on average
+RAYS = 24  # per Gaussian for mass, and as many for the sky; their noise of a tenth is less than the difference of neighbours
+NEAR = 0.08  # m; a Gaussian this close to the surface is part of it
+SUNK = 0.5  # m; Gaussians this far below the ground still belong to it, since those above let light through
+OFF = 0.03  # m; rays start this far off the surface, since captures are rough by as much
+LOOSE_CATCH = 0.4  # mass that leaves, blades and branches catch; on average they turn half of their area to the sky
 LOOSE_MOST = 0.7  # share of them that a cover can hide
-LEVEL = 0.9  # from which a Gaussian counts as part of a smooth surface
-UNEVEN = 0.3  # how level a Gaussian is that has no plane
-FLAT = 0.5  # thinnest over middle axis, below which a Gaussian has a normal of its own
+LEVEL = 0.9  # level from which a Gaussian counts as part of a smooth surface
+UNEVEN = 0.3  # level of a Gaussian that is not flat
+FLAT = 0.5  # ratio of the thinnest to the middle axis below which a Gaussian is flat and has a normal
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """N Gaussians in a weather."""
+    """The exposure of N Gaussians to an effect."""
 
     normals: Float[Tensor, "n 3"]
-    """Unit, metric: a flat Gaussian's own, turned to the surface's open side; else the surface's, and away from it up."""
+    """Unit normals in the metric frame. A flat Gaussian has its own normal, turned to the open side of the surface; the others
+    have that of the surface, or point up if they are away from it."""
     loose: Bool[Tensor, " n"]
-    """Away from the surface that is known: foliage, branches, the far background."""
+    """Whether a Gaussian is away from the mesh: foliage, branches, the far background."""
     catches: Float[Tensor, " n"]
-    """Mass that comes down on it relative to what an open horizontal area of the same size catches."""
+    """Mass that a Gaussian catches relative to an open horizontal area of the same size."""
     level: Float[Tensor, " n"]
-    """How well its own plane lies in the surface, 0..1: paving mirrors when it is wet, blades of grass do not."""
+    """Squared cosine between the plane of a Gaussian and the surface, 0..1: wet paving mirrors, blades of grass do not."""
     sky: Float[Tensor, " n"]
-    """Share of the sky it sees, weighted by the cosine; 1: an open horizontal surface."""
+    """Share of the sky that a Gaussian sees, weighted by the cosine; 1 for an open horizontal surface."""
 
     @staticmethod
     def of(metric: Gaussians, surface: SurfaceMesh, effect: Effect, *, seed: int = 0) -> Exposure:
-        """Of Gaussians in metres, within a surface that shelters."""
+        """The exposure of Gaussians.
+
+        Args:
+            metric: the frozen Gaussians in metres.
+            surface: the mesh that shelters them, in metres.
+            effect: its emission, material and wind give the directions of the particles.
+            seed: of the rays.
+        """
         generator = torch.Generator().manual_seed(seed)
         starts, normals, loose, level = _ground(metric, surface)
         ways, fluxes = arrivals(effect, RAYS, generator)
@@ -66,11 +74,19 @@ class Exposure:
 
 
 def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "r 3"], Float[Tensor, " r"]]:
-    """Velocities in m/s with which an effect's mass comes down, and the share of each over its fall speed, in s/m.
+    """Velocities with which the mass of an effect arrives at surfaces.
 
-    With them sum(share * -velocity . n) is the mass caught by a surface of normal n, relative to a horizontal one: the
-    velocities are drawn by the flux of mass through a horizontal area, with the mean wind at its reference height, gusts and
-    turbulence.
+    The velocities are drawn by the flux of mass through a horizontal area, with the mean wind at its reference height, gusts
+    and turbulence.
+
+    Args:
+        effect: its emission, material and wind are read.
+        count: number of velocities.
+        generator: source of the draws.
+
+    Returns:
+        Velocities in m/s, and for each its share divided by the fall speed, in s/m. With both, sum(share * -velocity . n) is
+        the mass caught by a surface of normal n relative to a horizontal one.
     """
     emission, wind = effect.emission, effect.wind
     diameters = np.geomspace(emission.smallest, emission.largest, 128)
@@ -82,7 +98,7 @@ def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Fl
     along = math.radians(wind.direction_degrees)
     gusts = wind.speed * (1 + wind.gustiness * torch.randn(count, generator=generator))
     velocities = wind.turbulence * torch.randn(count, 3, generator=generator)
-    velocities[:, 2] = -falling  # eddies take as much up as down
+    velocities[:, 2] = -falling  # eddies move as much mass up as down
     velocities[:, 0] += gusts * math.cos(along)
     velocities[:, 1] += gusts * math.sin(along)
     return velocities, 1 / (count * falling)
@@ -91,7 +107,7 @@ def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Fl
 def _ground(
     metric: Gaussians, surface: SurfaceMesh
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, " n"], Float[Tensor, " n"]]:
-    """Where rays of each Gaussian start, its normal, whether it is loose, and how level it lies."""
+    """The start of the rays of each Gaussian, its normal, whether it is loose, and its level."""
     up = torch.tensor([0.0, 0.0, 1.0])
     found = surface.closest(metric.means)
     loose = ~(found.distance < NEAR) & ~_beneath(metric.means, surface)
@@ -105,12 +121,12 @@ def _ground(
     starts = torch.where(loose[:, None], metric.means + OFF * up, found.points + OFF * found.normals)
     cosine = (own * normals).sum(1)
     level = torch.where(loose | ~flat, UNEVEN, cosine.square())
-    # A captured surface is rough by its voxels; Gaussians that lie in it know its slope better.
+    # The mesh of a capture is rough by its voxels; the normals of level Gaussians are more exact.
     turned = own * torch.where(cosine < 0, -1.0, 1.0)[:, None]
     return starts, torch.where((level > LEVEL)[:, None], turned, normals), loose, level
 
 
 def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor, " n"]:
-    """Whether the first thing above a point is the back of a surface: then it fills what a camera sees as that surface."""
+    """Whether a point is shortly below the back of the surface, where a Gaussian fills what a camera sees as the surface."""
     hits = surface.cast(points, torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3))
     return torch.isfinite(hits.distance) & (hits.distance < SUNK) & (hits.normal[:, 2] > 0)

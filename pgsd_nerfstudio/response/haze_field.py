@@ -1,12 +1,12 @@
-"""The air of a weather as a function of place and time: how much light it takes, where it is thick, how it comes.
+"""The haze of a weather as a function of place and time: its extinction, its patches, and its arrival.
 
-Fog and sand: Koschmieder (1924), extinction = ln 50 / visibility. Rain and snow: twice the shadow of the particles that bring
-the precipitation, in all the sizes that nature has and not only those that are simulated. Rain comes to 1.15-1.25 times the
-1.076 R^0.67 dB/km that Carbonneau & Wisely (1998) give, from 1 to 50 mm/h. Flakes are as lacy as the aggregates of Mitchell,
-"Use of mass- and area-dimensional power laws for determining precipitation particle terminal velocities" (1996, table 1),
-A = 0.2285 D^1.88 in cm, a third of a disc: full discs would be three times as thick. Half a mile is seen in 1 mm/h of water,
-where weather services draw the line to moderate snow; storms differ from each other by a factor of three and more (Rasmussen
-et al., "The estimation of snowfall rate using visibility", 1999).
+Fog and sand follow Koschmieder (1924): extinction = ln 50 / visibility. For rain and snow the extinction is twice the shadow of
+the particles that bring the precipitation, of all natural sizes and not only the simulated ones. For rain this is 1.15-1.25
+times the 1.076 R^0.67 dB/km of Carbonneau & Wisely (1998), from 1 to 50 mm/h. Flakes have the area of the aggregates of
+Mitchell, "Use of mass- and area-dimensional power laws for determining precipitation particle terminal velocities" (1996,
+table 1), A = 0.2285 D^1.88 in cm, a third of a disc; full discs would give three times the extinction. At 1 mm/h of water the
+visibility is half a mile, where weather services draw the line to moderate snow; storms differ from each other by a factor of
+three and more (Rasmussen et al., "The estimation of snowfall rate using visibility", 1999).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from pgsd_nerfstudio.response.patches import Patches
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.storage import content_key
 
-WALL = 5.0  # m, over which a front rises from clear air to all of it
-FADE_IN = 0.2  # of the onset: a front is not there all at once
-EDGE = 1.0  # m, over which parcels of fog take over from the medium
+WALL = 5.0  # m; a front rises over this from clear air to full weather
+FADE_IN = 0.2  # share of the onset in which a front becomes visible
+EDGE = 1.0  # m; over this the parcels of fog take over from the haze
 FIRST_SLICE = 0.4  # m
-SLICES, RAYS = 64, 44  # along the way and across the image, for patches whose logarithm deviates by 0.5
-RAINDROPS = 0.1e-3, 6e-3  # m, where Marshall & Palmer's law holds; few are larger
-SNOWFLAKES = 1e-3, 12e-3  # m, where Locatelli & Hobbs measured
-OPAQUE = 6.0  # optical depth beyond which nothing is told apart
+SLICES, RAYS = 64, 44  # samples along a ray and across the image, for patches whose logarithm deviates by 0.5
+RAINDROPS = 0.1e-3, 6e-3  # m; diameters for which Marshall & Palmer's law holds; few are larger
+SNOWFLAKES = 1e-3, 12e-3  # m; diameters that Locatelli & Hobbs measured
+OPAQUE = 6.0  # optical depth beyond which nothing is seen
 
 
 def full_extinction(effect: Effect) -> float:
-    """Of the whole weather, 1/m, on average; 0 where it has no haze."""
+    """Mean extinction of the full weather in 1/m; 0 if the effect has no haze."""
     emission = effect.emission
     if effect.haze is None:
         return 0.0
@@ -55,21 +55,21 @@ def full_extinction(effect: Effect) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Front:
-    """A wall of weather that the wind carries over the ground, clear before it and all of it behind."""
+    """A wall of weather that the wind carries over the ground, with clear air before it and full weather behind it."""
 
     along: tuple[float, float]
-    """Horizontal direction of its way, of length 1, metric."""
+    """Unit vector of its motion, horizontal, in the metric frame."""
     start: float
-    """Where it stands at second 0, in metres along its way."""
+    """Position at second 0, in metres along its motion."""
     speed: float
-    """m/s."""
+    """Speed in m/s."""
 
     @staticmethod
     def of(arrival: Arrival) -> Front:
-        """That of the particles, which starts at the domain's upwind corner.
+        """The front of the particles, which starts at the upwind corner of the domain.
 
         Raises:
-            ValueError: they do not come behind a front.
+            ValueError: the particles do not arrive as a front.
         """
         if not arrival.is_front:
             raise ValueError(f"only what arrives as a front within an onset has one, found {arrival.timeline}")
@@ -78,43 +78,46 @@ class Front:
         return Front(along=(x, y), start=start, speed=arrival.front_position(1.0) - start)
 
     def passed(self, points: Float[Tensor, "n 3"], seconds: float) -> Float[Tensor, " n"]:
-        """How much of the weather has reached metric points, 0..1."""
+        """Share of the full weather at metric points at a second, 0..1."""
         behind = self.start + self.speed * seconds - points[:, 0] * self.along[0] - points[:, 1] * self.along[1]
         return _smooth_step(behind / WALL + 0.5)
 
     def left(self, domain: Domain, seconds: float) -> float:
-        """Metres by which all of it is beyond the domain; negative before."""
+        """Distance in metres of the whole wall behind the domain at a second; negative until it has passed."""
         return self.start + self.speed * seconds - WALL / 2 - _extent(domain, self.along)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HazeField:
-    """What hangs in the air of one scene under one weather."""
+    """The haze of one scene under one weather."""
 
     airlight: tuple[float, float, float]
+    """Colour of the haze, sRGB."""
     extinction: float
-    """Of the whole weather at the ground, 1/m; 0: the air is clear."""
+    """Extinction of the full weather at the ground in 1/m; 0: the air is clear."""
     timeline: Timeline
     front: Front | None
-    """None: it comes everywhere at once."""
+    """None: the haze arrives everywhere at once."""
     scale_height: float
+    """Height in metres over which the haze thins to 1 / e."""
     patches: Patches | None
     domain: Domain
+    """Box of air in metres in which the particles are simulated."""
     parcels: float
-    """Share of the extinction within the domain that simulated particles bring, each by its own opacity; the field leaves it to
-    them."""
+    """Share of the extinction within the domain that the simulated particles contribute by their own opacity. The haze leaves
+    it out there."""
     frame: Frame
     identity: str
-    """Hash of all that it was made from."""
+    """Hash of all that the haze was made from."""
 
     @staticmethod
     def of(effect: Effect, frame: Frame, domain: Domain, *, seed: int = 0) -> HazeField:
         """The haze of an effect.
 
         Args:
-            effect: its haze may be None: then the air is clear at all times.
-            frame: of the scene.
-            domain: box of air that the particles are simulated in.
+            effect: if its haze is None, the air is clear at all times.
+            frame: metric frame of the scene.
+            domain: box of air in metres in which the particles are simulated.
             seed: of the patches.
         """
         haze, wind, timeline = effect.haze, effect.wind, effect.timeline
@@ -134,14 +137,14 @@ class HazeField:
             scale_height=math.inf if haze is None else haze.scale_height,
             patches=patches,
             domain=domain,
-            # Where opacity comes from the droplets that a particle stands for, particles are the medium.
+            # If the opacity of particles follows from their droplets, the particles are the haze.
             parcels=effect.emission.share if effect.appearance.active.opacity is None else 0.0,
             frame=frame,
             identity=content_key(*made_from, frame.metres_per_unit, frame.rotation, frame.origin),
         )
 
     def at(self, seconds: float) -> Medium | None:
-        """The air at a second, in scene units; None where it is clear."""
+        """The haze at a second as a medium in scene units; None if the air is clear."""
         strength = self._strength(seconds)
         if strength == 0.0:
             return None
@@ -155,7 +158,7 @@ class HazeField:
         return Medium(airlight, extinction, self._froxels())
 
     def key(self, seconds: float) -> bytes:
-        """Moments with the same key have the same air; empty where it is clear."""
+        """Name of the haze at a second; equal names mean equal haze, and clear air has an empty name."""
         strength = self._strength(seconds)
         if strength == 0.0:
             return b""
@@ -163,7 +166,12 @@ class HazeField:
         return f"{self.identity} {strength!r} {seconds if moves else None!r}".encode()
 
     def density(self, points: Float[Tensor, "n 3"], seconds: float) -> Float[Tensor, " n"]:
-        """Extinction at metric points relative to that of the whole weather at the ground, particles left out."""
+        """Extinction without the particles, relative to that of the full weather at the ground.
+
+        Args:
+            points: places in metres.
+            seconds: the moment.
+        """
         found = torch.ones_like(points[:, 0])
         if math.isfinite(self.scale_height):
             found = torch.exp(-points[:, 2].clamp_min(0.0) / self.scale_height)
@@ -176,12 +184,12 @@ class HazeField:
         return found
 
     def _strength(self, seconds: float) -> float:
-        """Extinction in 1/m where all of what has come by then is."""
+        """Greatest mean extinction in 1/m at a second: that behind the front, or that of all air if there is no front."""
         share = self.timeline.share(seconds)
         return self.extinction * (min(share / FADE_IN, 1.0) if self.front is not None else share)
 
     def _is_even(self, seconds: float) -> bool:
-        """Whether the air is the same everywhere, as far as anything is seen."""
+        """Whether the haze is the same everywhere within sight."""
         gone = self.front is None or self.front.left(self.domain, seconds) > self._reach
         return gone and self.patches is None and math.isinf(self.scale_height) and self.parcels == 0.0
 
@@ -191,13 +199,14 @@ class HazeField:
 
     @property
     def _reach(self) -> float:
-        """Metres beyond which nothing is told apart; longer among patches, as most of the air is thinner than its mean."""
+        """Distance in metres beyond which nothing is seen. It is longer with patches, where most of the air is thinner than the
+        mean."""
         opaque = OPAQUE / self.extinction * math.exp(0.5 * self._deviation**2)
         return min(max(opaque, 60.0), 20_000.0)
 
     def _froxels(self) -> Froxels:
         unit = self.frame.metres_per_unit
-        # What is off grows with the contrast of the patches, and falls with the square of how far apart the samples are.
+        # The error grows with the contrast of the patches and with the square of the distance between samples.
         finer = max(1.0, self._deviation / 0.5) ** 0.3
         return Froxels(
             nearest=FIRST_SLICE / unit, farthest=self._reach / unit, slices=round(SLICES * finer), rays=round(RAYS * finer)
@@ -214,12 +223,12 @@ def _extent(domain: Domain, along: tuple[float, float]) -> tuple[float, float]:
 
 
 def _inside(domain: Domain, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """1 within, 0 outside; a soft edge whose middle is the face, so that across it nothing is counted twice."""
+    """1 inside the domain and 0 outside, with a soft edge centred on the faces, so that no extinction is counted twice."""
     lower, upper = torch.tensor(domain.lower).to(points), torch.tensor(domain.upper).to(points)
     return (_smooth_step((points - lower) / EDGE + 0.5) * _smooth_step((upper - points) / EDGE + 0.5)).prod(dim=1)
 
 
 def _smooth_step(x: Tensor) -> Tensor:
-    """From 0 at 0 to 1 at 1, level at both ends."""
+    """A cubic from 0 at 0 to 1 at 1 that is level at both ends."""
     x = x.clamp(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

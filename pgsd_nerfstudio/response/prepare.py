@@ -1,4 +1,4 @@
-"""The answer of a scene to a weather, made once: exposure by rays, the sun by its shadows, haze by the box of air."""
+"""Prepare the answer of a scene to a weather: exposure by rays, the sun from its shadows, haze from the box of air."""
 
 from __future__ import annotations
 
@@ -27,24 +27,29 @@ from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-SOLID = 0.3  # opacity from which a Gaussian's colour is asked for the sun
-NEIGHBOURS = 16
-MOST_SOFTENING = 3.0  # a shadow's colours hold noise and bounced light, which would shine
-_REVISION = 2  # of what is computed; stored answers of another one are not used
+SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
+NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
+MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
+_REVISION = 2  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
     scene: Scene, surface: SurfaceMesh, effect: Effect, *, seconds: float, seed: int = 0, edits: Edits | None = None
 ) -> Answer:
-    """How a scene answers an effect; what is costly is computed once and then read from the cache.
+    """The answer of a scene to an effect. Its costly parts are computed once and then read from the cache.
 
     Args:
-        seconds: length of the weather: when edited pictures are reached.
+        scene: the frozen scene.
+        surface: its mesh in metres, which casts shadows and shelters.
+        effect: the weather.
+        seconds: second at which the edits are reached in full.
+        seed: of rays, patches and the variation of the cover.
+        edits: change by edited pictures, from `edits_of`.
 
     Raises:
         OSError: the cache could not be written.
     """
-    # Only what rays find out is kept, so only what they depend on names the file.
+    # The file holds only the results of rays, so its key holds only the inputs of the rays.
     parts = (effect.emission, effect.material, effect.wind, effect.ambience)
     key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, *parts, seed)
     path = cache_dir() / "answers" / f"{key}.safetensors"
@@ -59,7 +64,7 @@ def answer_of(
 
 
 def save_answer(path: Path, answer: Answer) -> None:
-    """Store what was computed by rays, for `stored_answer`.
+    """Store the exposure, the softening and the edits of an answer, for `stored_answer`.
 
     Raises:
         OSError: the file could not be written.
@@ -73,7 +78,18 @@ def save_answer(path: Path, answer: Answer) -> None:
 
 
 def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, seed: int = 0) -> Answer | None:
-    """The answer of a file; None where there is none, or where it is damaged or of another scene or version."""
+    """Read a stored answer.
+
+    Args:
+        path: file of `save_answer`.
+        scene: the frozen scene that the answer was made for.
+        effect: the weather.
+        seconds: as for `answer_of`.
+        seed: as for `answer_of`.
+
+    Returns:
+        None if the file is missing or damaged, or belongs to another scene or revision.
+    """
     stored = load_tensors(path)
     if stored is None or stored[1].get("revision") != _REVISION:
         return None
@@ -96,7 +112,17 @@ def composed(
     seed: int = 0,
     edits: Edits | None = None,
 ) -> Answer:
-    """The answer from what rays have found out; haze and layers follow from the effect."""
+    """The answer from the results of rays; haze and coating follow from the effect.
+
+    Args:
+        scene: the frozen scene.
+        effect: the weather.
+        exposure: of the frozen Gaussians.
+        softening: factor on linear light in full weather; None: no sun was found.
+        seconds: second at which the edits are reached in full.
+        seed: of patches and the variation of the cover.
+        edits: change by edited pictures.
+    """
     return Answer(
         effect=effect,
         exposure=exposure,
@@ -111,7 +137,14 @@ def composed(
 
 
 def edits_of(scene: Scene, folder: Path, device: torch.device | str, *, seed: int = 0) -> Edits:
-    """The change of the scene that edited pictures of its views ask for; fitted once, interruptible, kept in the cache.
+    """The edits that edited pictures of a scene's views ask for. They are fitted once and then read from the cache; an
+    interrupted fit resumes.
+
+    Args:
+        scene: the frozen scene.
+        folder: holds the edited pictures.
+        device: device of the fit.
+        seed: of the order of the views.
 
     Raises:
         ValueError: the folder holds no picture of a view, or one that cannot be read.
@@ -129,14 +162,24 @@ def edits_of(scene: Scene, folder: Path, device: torch.device | str, *, seed: in
 
 
 def to_metric(scene: Scene) -> Gaussians:
-    """The frozen Gaussians in metres; plain colours."""
+    """The frozen Gaussians in metres, with plain RGB without dependence on the direction."""
     frozen = scene.gaussians
     plain = 0.5 + SH_C0 * (frozen.colors if frozen.colors.ndim == 2 else frozen.colors[:, 0])
     return scene.frame.gaussians_to_metric(replace(frozen, colors=plain))
 
 
 def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect) -> Float[Tensor, " n"] | None:
-    """Factor on linear light when the ambience's clouds have come; None where they change nothing or no sun is found."""
+    """Factor on linear light in full weather, when the clouds of the ambience soften the shadows of the sun.
+
+    Args:
+        metric: the frozen Gaussians in metres, with plain RGB.
+        exposure: of these Gaussians.
+        surface: mesh of the scene in metres.
+        effect: its ambience gives the clouds.
+
+    Returns:
+        None if the effect has no clouds or no sun was found.
+    """
     if effect.ambience is None or effect.ambience.clouds == 0:
         return None
     sun = sun_of(metric, exposure, surface)
@@ -144,13 +187,19 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
         return None
     seen = lit(sun, metric.means, exposure.normals, surface)
     factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
-    # Shadows of a mesh lie some centimetres beside those of the picture: what neighbours share leaves no bright rims.
+    # Shadows of the mesh are some centimetres off those of the picture; averaging over neighbours avoids bright rims.
     _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
     return factor.log()[torch.from_numpy(around).reshape(len(factor), -1)].mean(1).exp()
 
 
 def sun_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh) -> Sunlight | None:
-    """The sun by the shadows in a scene's own colours, asked of what lies smoothly in its surface; None: there is none."""
-    asked = (exposure.level > LEVEL) & (metric.opacities > SOLID)
+    """The sun of a captured scene, from the shadows in the colours of level and solid Gaussians; None if no sun was found.
+
+    Args:
+        metric: the frozen Gaussians in metres, with plain RGB.
+        exposure: of these Gaussians.
+        surface: mesh of the scene in metres.
+    """
+    level = (exposure.level > LEVEL) & (metric.opacities > SOLID)
     light = luminance(linear(metric.colors))
-    return find_sunlight(metric.means[asked], exposure.normals[asked], light[asked], surface)
+    return find_sunlight(metric.means[level], exposure.normals[level], light[level], surface)

@@ -1,4 +1,4 @@
-"""The search for the sun of a captured scene: neighbours compared, skies fitted, suns tried. `sunlight` tells the method."""
+"""Search for the sun of a captured scene: compare neighbours, fit skies, try suns. `sunlight` describes the method."""
 
 from __future__ import annotations
 
@@ -17,61 +17,83 @@ from torch.nn.functional import normalize
 from pgsd_nerfstudio.response.rays import GOLDEN, cosine_directions, frames, open_cosines, open_sky, ray_starts
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-POINTS, FEWEST = 8000, 400  # whose light is compared, at most and at least
-NEIGHBOURS, PARTNERS = 60, 6  # of a point: how many stand for its surroundings, and with how many of these it is compared
-ALIKE, TURN = 0.8, 1.0  # cosine between normals that are compared; metres that a turn of the normal by one radian counts as
-NEAR = 0.06  # m off the surface, within which a point is taken to lie on it
-DARKEST = 5e-3  # of the median luminance: below, a colour says nothing about light
-CANDIDATES, LOWEST = 300, math.sin(math.radians(4.0))  # suns tried first, and the sine of the lowest's elevation
-RIVALS, FINER = 3, (8.0, 3.0)  # suns that are looked at closely, with 24 others within so many degrees of each
-RATIOS = (0.4, 1.2, 3.6, 10.8)
-STRONGEST = 60.0  # ratio; the clear sky's is 5 to 10
-FOLDS, CELLS = 16, 64  # of equal numbers of points: what is left out at once, and what counts as one observation
+POINTS, FEWEST = 8000, 400  # greatest and least number of points whose light is compared
+NEIGHBOURS, PARTNERS = 60, 6  # nearest neighbours of a point, and the number of them that it is compared with
+ALIKE, TURN = 0.8, 1.0  # least cosine between compared normals; distance in metres that one radian between normals counts as
+NEAR = 0.06  # m; points this close to the mesh are on it
+DARKEST = 5e-3  # share of the median luminance; darker colours tell nothing about light
+CANDIDATES, LOWEST = 300, math.sin(math.radians(4.0))  # number of suns tried first, and sine of their least elevation
+RIVALS, FINER = 3, (8.0, 3.0)  # number of suns that are refined, and degrees within which 24 others are tried around each
+RATIOS = (0.4, 1.2, 3.6, 10.8)  # ratios of sun to sky that are tried
+STRONGEST = 60.0  # greatest ratio; that of a clear sky is 5 to 10
+FOLDS, CELLS = 16, 64  # parts with equal numbers of points: left out together, and counted as one observation
 SKY_RAYS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Yard:
-    """Points on the surface, what light reaches them from where, and how their log luminance differs from their neighbours'."""
+class Samples:
+    """N points on the surface with their view of the sky, and P pairs of neighbours with their difference of log luminance."""
 
     starts: Float[Tensor, "n 3"]
+    """Starts of rays in metres."""
     normals: Float[Tensor, "n 3"]
     sky: Float[Tensor, " n"]
+    """Share of the sky, weighted by the cosine."""
     slope: Float[Tensor, "n 3"]
-    """Mean direction of the open part of the hemisphere, zero elsewhere: what a gradient of the sky adds."""
+    """Mean over the hemisphere of the open directions, which is the light of a gradient of the sky."""
     first: Int[Tensor, " p"]
+    """Index of the first point of each pair."""
     second: Int[Tensor, " p"]
+    """Index of the second point of each pair."""
     differences: Float[Tensor, " p"]
+    """Log luminance of the first point minus that of the second."""
     cells: Int[Tensor, " p"]
+    """Cell of the first point, 0..CELLS-1."""
 
     @property
     def spread(self) -> float:
+        """Standard deviation of the differences."""
         return scatter(self.differences)
 
     def contrast(self, light: Float[Tensor, " n *k"]) -> Float[Tensor, " p *k"]:
-        """How log light differs between neighbours."""
+        """Differences of log light in the pairs, from light at the points."""
         log = light.clamp_min(1e-3).log()
         return log[self.first] - log[self.second]
 
     def by_cell(self, losses: Float[Tensor, " p *k"]) -> Float[Tensor, " cells *k"]:
-        """Sums over neighbours, relative to the number of all."""
+        """Sums over the pairs of each cell, divided by the number of all pairs."""
         return torch.zeros(CELLS, *losses.shape[1:]).index_add_(0, self.cells, losses) / len(self.cells)
 
 
 class Fit(NamedTuple):
-    """Light without albedo."""
+    """The light of a fitted sun and sky, without albedo."""
 
     ratio: float
+    """Sun to sky, as Sunlight.ratio."""
     bounce: float
+    """Surroundings to sky, as Sunlight.bounce."""
     ambient: Float[Tensor, " n"]
+    """Light without the sun."""
     light: Float[Tensor, " n"]
     loss: float
+    """Mean bounded loss of the pairs."""
 
 
-def yard_of(
+def sample_surface(
     points: Tensor, normals: Tensor, luminance: Tensor, surface: SurfaceMesh, generator: torch.Generator
-) -> Yard | None:
-    """A choice of points that covers the surface evenly; None where there are too few, or few lie like their neighbours."""
+) -> Samples | None:
+    """Choose points that cover the surface evenly, and pair them with neighbours.
+
+    Args:
+        points: [n, 3] in metres.
+        normals: [n, 3] unit, towards the open side.
+        luminance: [n] linear.
+        surface: the mesh in metres.
+        generator: source of the choice.
+
+    Returns:
+        None if there are too few points, or too few with the orientation of their neighbours.
+    """
     if len(surface.triangles) == 0 or len(points) < FEWEST:
         return None
     useful = torch.nonzero(luminance > DARKEST * luminance.median())[:, 0]
@@ -91,11 +113,12 @@ def yard_of(
     if len(first) < FEWEST:
         return None
     cells = _cells(place[:, :2].numpy())[first]
-    return Yard(starts, facing, sky, slope, first, second, log[first] - log[second], cells)
+    return Samples(starts, facing, sky, slope, first, second, log[first] - log[second], cells)
 
 
 def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generator: torch.Generator) -> Int[Tensor, " m"]:
-    """At most one point a cube, in random order; cubes so small that there are enough. Few points are all taken."""
+    """Indices of points near the mesh, at most one in a cube. The cubes shrink until there are enough points; if there are few,
+    all are taken."""
     within = torch.nonzero(((points > bounds[0] - NEAR) & (points < bounds[1] + NEAR)).all(1))[:, 0]
     mixed = within[torch.randperm(len(within), generator=generator)]
     if len(mixed) <= 1.5 * POINTS:
@@ -112,7 +135,7 @@ def _thinned(points: Float[Tensor, "n 3"], bounds: Float[Tensor, "2 3"], generat
 
 
 def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, " n"]:
-    """Cells of equal numbers of points, halved along their longer side; consecutive ones together make a fold."""
+    """Cells of equal numbers of points, made by halving along the longer side; consecutive cells make a fold."""
     labels, parts = np.zeros(len(ground), np.int64), [np.arange(len(ground))]
     while len(parts) < CELLS:
         halves = []
@@ -126,36 +149,44 @@ def _cells(ground: Float[np.ndarray, "n 2"]) -> Int[Tensor, " n"]:
 
 
 def scatter(errors: Float[Tensor, " p"]) -> float:
-    """Standard deviation by the median of magnitudes; never zero, as where a scene is of one colour."""
+    """Standard deviation from the median of magnitudes, at least 1e-4, for scenes of one colour."""
     return max(1.4826 * float(errors.abs().median()), 1e-4)
 
 
 def bounded_loss(errors: Tensor, width: float) -> Tensor:
+    """The loss of Geman & McClure (1987), e^2 / (e^2 + w^2), elementwise with the width w."""
     squares = errors.square()
     return squares / (squares + width**2)
 
 
 def _bounded(z: np.ndarray) -> np.ndarray:
-    """The same of squares in units of the width, with its first two derivatives."""
+    """The loss of squares in units of the width, with its first two derivatives."""
     return np.stack([z / (1 + z), (1 + z) ** -2.0, -2 * (1 + z) ** -3.0])
 
 
-def fitted(yard: Yard, cosines: Float[Tensor, " n"], *, width: float, strongest: float) -> Fit:
-    """Ratio, bounce and gradient of the sky with the least loss, for one sun; `strongest` = 0: for none."""
-    closed = 1 - yard.sky
-    shares = torch.cat([cosines[:, None], closed[:, None], yard.slope], dim=1)
+def fitted(samples: Samples, cosines: Float[Tensor, " n"], *, width: float, strongest: float) -> Fit:
+    """Fit ratio, bounce and gradient of the sky to the differences of neighbours, for one sun.
+
+    Args:
+        samples: points and pairs.
+        cosines: between normals and the sun at the points, 0 in shadow.
+        width: of the bounded loss.
+        strongest: greatest ratio; 0 for a sky without a sun.
+    """
+    closed = 1 - samples.sky
+    shares = torch.cat([cosines[:, None], closed[:, None], samples.slope], dim=1)
 
     def light(x: np.ndarray) -> Tensor:
-        return (yard.sky + shares @ torch.from_numpy(x).float()).clamp_min(1e-3)
+        return (samples.sky + shares @ torch.from_numpy(x).float()).clamp_min(1e-3)
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        return (yard.differences - yard.contrast(light(x))).double().numpy() / width
+        return (samples.differences - samples.contrast(light(x))).double().numpy() / width
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         slopes = shares / light(x)[:, None]
-        return (slopes[yard.second] - slopes[yard.first]).double().numpy() / width
+        return (slopes[samples.second] - slopes[samples.first]).double().numpy() / width
 
-    # The gradient keeps the sky's radiance positive; 2 upwards is the overcast sky of the CIE.
+    # The bounds keep the radiance of the sky positive; an upward gradient of 2 is the overcast sky of the CIE.
     upper = [max(strongest, 1e-9), 1.5, 0.7, 0.7, 2.0]
     found = least_squares(
         residuals,
@@ -165,30 +196,48 @@ def fitted(yard: Yard, cosines: Float[Tensor, " n"], *, width: float, strongest:
         loss=_bounded,  # pyright: ignore[reportArgumentType]
         max_nfev=30,
     ).x
-    # Such a sky gives open level ground 1 + 2/3 of its vertical gradient.
+    # The irradiance of such a sky on open level ground is 1 + 2/3 of its vertical gradient.
     level, ambient = 1 + 2 / 3 * found[4], light(np.concatenate([[0.0], found[1:]]))
-    loss = float(bounded_loss(yard.differences - yard.contrast(light(found)), width).mean())
+    loss = float(bounded_loss(samples.differences - samples.contrast(light(found)), width).mean())
     return Fit(float(found[0] / level), float(found[1] / level), ambient, light(found), loss)
 
 
 def losses_by_cell(
-    yard: Yard, cosines: Float[Tensor, "n d"], ambient: Float[Tensor, " n"], width: float
+    samples: Samples, cosines: Float[Tensor, "n d"], ambient: Float[Tensor, " n"], width: float
 ) -> Float[Tensor, "d ratios cells"]:
-    """How badly each sun at each ratio foretells the differences."""
+    """Bounded loss by cell of each sun at each of the RATIOS.
+
+    Args:
+        samples: points and pairs.
+        cosines: between normals and each sun at the points, 0 in shadow.
+        ambient: light without the sun at the points.
+        width: of the bounded loss.
+    """
     ratios, losses = torch.tensor(RATIOS), []
     for cosine in cosines.unbind(1):
         light = ambient[:, None] + cosine[:, None] * ratios
-        losses.append(yard.by_cell(bounded_loss(yard.differences[:, None] - yard.contrast(light), width)).T)
+        losses.append(samples.by_cell(bounded_loss(samples.differences[:, None] - samples.contrast(light), width)).T)
     return torch.stack(losses)
 
 
-def search(yard: Yard, surface: SurfaceMesh, width: float) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "n d"], list[int]]:
-    """All suns tried, their cosines at the points, and which few are the best; under a plain sky."""
-    plain = yard.sky + 0.2 * (1 - yard.sky)
+def search(
+    samples: Samples, surface: SurfaceMesh, width: float
+) -> tuple[Float[Tensor, "d 3"], Float[Tensor, "n d"], list[int]]:
+    """Try suns over the whole sky under a uniform sky, and refine the best.
+
+    Args:
+        samples: points and pairs.
+        surface: the mesh in metres, which casts shadows.
+        width: of the bounded loss.
+
+    Returns:
+        Unit directions of all suns tried, their cosines at the points, and the indices of the best few.
+    """
+    plain = samples.sky + 0.2 * (1 - samples.sky)
 
     def judged(directions: Tensor) -> tuple[Tensor, Tensor]:
-        cosines = open_cosines(yard.starts, yard.normals, surface, directions)
-        return cosines, losses_by_cell(yard, cosines, plain, width).sum(2).amin(1)
+        cosines = open_cosines(samples.starts, samples.normals, surface, directions)
+        return cosines, losses_by_cell(samples, cosines, plain, width).sum(2).amin(1)
 
     directions = _above(CANDIDATES)
     cosines, losses = judged(directions)
@@ -212,8 +261,8 @@ def search(yard: Yard, surface: SurfaceMesh, width: float) -> tuple[Float[Tensor
     return directions, cosines, best
 
 
-def foretold_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, " cells"]:
-    """Losses by cell of the sun, and ratio, that is best without the cell's fold."""
+def predicted_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, " cells"]:
+    """Losses by cell by cross-validation: each fold is predicted by the sun and ratio that fit the other folds best."""
     choices = losses.flatten(0, 1)
     folds = choices.reshape(len(choices), FOLDS, CELLS // FOLDS)
     chosen = (folds.sum((1, 2))[:, None] - folds.sum(2)).argmin(0)
@@ -221,12 +270,12 @@ def foretold_losses(losses: Float[Tensor, "d ratios cells"]) -> Float[Tensor, " 
 
 
 def standard_errors(gains: Float[Tensor, " cells"]) -> float:
-    """The mean in units of its standard error."""
+    """The mean of `gains` in units of its standard error."""
     return float(gains.mean() / (gains.std() / math.sqrt(len(gains))).clamp_min(1e-12))
 
 
 def _above(count: int) -> Float[Tensor, "k 3"]:
-    """Directions spread evenly over the sky above the lowest elevation of a sun."""
+    """Unit directions that cover the sky evenly above the least elevation of a sun."""
     k = torch.arange(count) + 0.5
     z = LOWEST + (1 - LOWEST) * k / count
     level = (1 - z**2).sqrt()
