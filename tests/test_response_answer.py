@@ -1,4 +1,4 @@
-"""The frozen scene's answer: nothing before it comes, nothing of the scene itself changed, every part where it belongs."""
+"""The answer of the frozen scene: the untouched scene before the weather, unchanged tensors, and each part in its place."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -133,7 +133,7 @@ def test_without_ambience_and_accumulation_only_the_air_changes():
     assert answer(bare).at(5.0) is None
 
 
-def test_edited_pictures_come_with_the_layer_and_end_as_they_are():
+def test_edited_pictures_come_with_the_cover_and_end_as_they_are():
     n = GRID**2
     edits = Edits(torch.full((n, 3), 0.3), torch.full((n,), 0.5), torch.full((n, 3), 0.2))
     snow = replace(effect("snowfall"), ambience=None, haze=None)
@@ -176,7 +176,7 @@ def test_baked_gaussians_look_like_the_moment_without_air():
     assert baked(None, floor()).colors.equal(floor().colors)
 
 
-def test_landed_particles_take_the_light_of_their_place():
+def test_collided_particles_take_the_light_of_their_place():
     n = GRID**2
     exposure = answer(effect("snowfall")).exposure
     half = torch.where(UNIT * floor().means[:, 0] < 0, 0.1, 1.0)  # one side of the floor sees hardly any sky

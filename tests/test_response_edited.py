@@ -1,4 +1,4 @@
-"""A change of the frozen scene fitted to edited pictures: it finds a known edit, and touches nothing that no picture shows."""
+"""Edits of the frozen scene fitted to edited pictures: a known edit is found, and what no picture shows is not changed."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def test_no_change_can_still_learn():
 
 
 def test_a_change_of_other_gaussians_is_refused(scene):
-    with pytest.raises(ValueError, match="one of 5 Gaussians, found 288"):
+    with pytest.raises(ValueError, match="for 5 Gaussians, found 288"):
         some_edits(5).applied(scene.gaussians, 1.0)
     with pytest.raises(ValueError, match=r"one share for each of the 288 Gaussians, found shape \(5,\)"):
         some_edits(288).applied(scene.gaussians, torch.ones(5))

@@ -1,4 +1,4 @@
-"""The record of Gaussians: what moves keeps its displacement through everything that is done to a set."""
+"""Sets of Gaussians: displacements stay with their Gaussians in every operation on a set."""
 
 from __future__ import annotations
 
