@@ -142,6 +142,7 @@ def test_no_weight_ever_gets_a_gradient(prior):
     assert not prior.predict_v(torch.randn(1, 3, 4, 4, 6, requires_grad=True), 10, prior.encode_prompt([PROMPT])).requires_grad
 
 
+@pytest.mark.mistyped
 @pytest.mark.parametrize(
     ("shape", "message"),
     [

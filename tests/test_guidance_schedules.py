@@ -104,6 +104,7 @@ def test_fixed_schedules_need_to_know_the_step(where):
         regularization_scale("cosine", 1.0, *where)
 
 
+@pytest.mark.mistyped
 def test_unknown_weighting_is_refused():
     with pytest.raises(ValueError, match="adaptive, constant, linear, exponential or cosine, got 'cubic'"):
         regularization_scale("cubic", 1.0)  # type: ignore[arg-type]

@@ -206,6 +206,7 @@ def test_what_is_no_weights_file_is_refused_in_one_sentence(tmp_path):
         TinyEncoder.load(tmp_path)
 
 
+@pytest.mark.mistyped
 def test_odd_sizes_and_paddings_are_refused(tiny):
     with pytest.raises(ValueError, match="multiples of 8, found 20x16"):
         tiny.encode(torch.rand(1, 3, 20, 16))

@@ -247,6 +247,7 @@ def test_settings_out_of_range_are_refused(wrong, message):
         DistillationConfig(**wrong)
 
 
+@pytest.mark.mistyped
 def test_unknown_kinds_are_refused_with_the_known_ones():
     with pytest.raises(ValueError, match="one of sds, nfsd, bridge, got 'vsd'"):
         gradient(DistillationConfig(variant="vsd"), 300, torch.randn(SHAPE))  # type: ignore[arg-type]
@@ -254,6 +255,7 @@ def test_unknown_kinds_are_refused_with_the_known_ones():
         gradient(DistillationConfig(omega="x0"), 300, torch.randn(SHAPE))  # type: ignore[arg-type]
 
 
+@pytest.mark.mistyped
 def test_a_clip_takes_variants_too():
     """Through an encoder that halves: the gradient on pixels is half that on latents, shared by the frames."""
     told, clip = embeddings(), torch.rand(3, 4, 5, 6, generator=seeded(1))

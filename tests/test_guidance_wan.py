@@ -248,6 +248,7 @@ def test_clip_shape_is_the_published_one_or_as_many_frames_as_asked(tiny, prior)
         WanPrior.load(tiny, frames=10)
 
 
+@pytest.mark.mistyped
 @pytest.mark.parametrize(
     ("shape", "message"),
     [

@@ -164,7 +164,7 @@ class VideoPrior(ABC):
     @abstractmethod
     def predict_v(
         self,
-        noisy: Float[Tensor, "1|b lt c lh lw"],
+        noisy: Float[Tensor, "#b lt c lh lw"],
         timestep: int,
         text_embeddings: Float[Tensor, "b l d"],
     ) -> Float[Tensor, "b lt c lh lw"]:

@@ -40,7 +40,7 @@ def alpha_bar(sigma: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     return (1 - sigma) ** 2 / ((1 - sigma) ** 2 + sigma**2)
 
 
-def v_from_flow(flow: Float[Tensor, " b *s"], noisy: Float[Tensor, " 1|b *s"], sigma: float) -> Float[Tensor, " b *s"]:
+def v_from_flow(flow: Float[Tensor, " b *s"], noisy: Float[Tensor, " #b *s"], sigma: float) -> Float[Tensor, " b *s"]:
     """v = (1 - 2 sigma) x_t + n u, of the flow u that was predicted at y = n x_t, with `noisy` = x_t."""
     return (1 - 2 * sigma) * noisy + math.hypot(1 - sigma, sigma) * flow
 
@@ -89,7 +89,7 @@ class WanPrior(VideoPrior):
     @torch.no_grad()
     def predict_v(
         self,
-        noisy: Float[Tensor, "1|b lt c lh lw"],
+        noisy: Float[Tensor, "#b lt c lh lw"],
         timestep: int,
         text_embeddings: Float[Tensor, "b l d"],
     ) -> Float[Tensor, "b lt c lh lw"]:
