@@ -20,6 +20,7 @@ from pgsd_nerfstudio.cli.refusal import Refusal
 from pgsd_nerfstudio.effects import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL, Effect, InitialLook, initial_look
 from pgsd_nerfstudio.effects.application import applied, remarks
 from pgsd_nerfstudio.effects.matter import INTENSITIES
+from pgsd_nerfstudio.effects.options import EffectOptions
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.effects.request import BASES, LIMITS, Request
 from pgsd_nerfstudio.effects.timeline import Timeline
@@ -30,6 +31,7 @@ from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.laws import fall_speeds
 from pgsd_nerfstudio.physics.laws.populations import extinction, fall_speed, integral, number_density
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.options import SceneOptions
 
 PROMPT = "Purple things are falling in {scene}"
 PURPLE = (0.5, 0.0, 0.5)
@@ -319,35 +321,31 @@ def test_words_that_are_no_weather_get_one_sentence_and_exit_code_1(tmp_path, ca
     assert list(tmp_path.iterdir()) == []
 
 
-def previewed(weather: str, **flags: Any) -> Effect:
-    """The effect with which `pgsd preview` sets out."""
-    taken: list[Effect] = []
+def test_a_preview_in_words_says_what_it_understood_and_shows_that(yard, tmp_path, capsys, monkeypatch):
+    made: list[Effect] = []
 
-    class Looked(Preview):
-        def _pictures(self, scene: Any, effect: Effect, cameras: Any) -> Any:
-            taken.append(effect)
-            raise Refusal("seen enough")
+    def stop(prepared: Any, effect: Effect, *others: Any, **named: Any) -> None:
+        made.append(effect)
+        raise ValueError("seen enough")
 
-    with pytest.raises(Refusal, match="seen enough"):
-        Looked(weather=weather, **flags).run()
-    return taken[0]
-
-
-def test_a_preview_in_words_says_what_it_understood_and_shows_that(yard, tmp_path, capsys):
-    where = {"load_scene": str(yard[0]), "data": yard[1], "output": tmp_path / "v.mp4"}
-    effect = previewed("heavy purple blorp rain that accumulates", **where)
+    monkeypatch.setattr("pgsd_nerfstudio.weather.making.make_weather", stop)
+    scene = SceneOptions(load_scene=yard[0], data=yard[1])
+    heavy = EffectOptions(weather="heavy purple blorp rain that accumulates")
+    for options in (heavy, EffectOptions(weather="purple snow", intensity=0.7, exposure=0.01)):
+        with pytest.raises(Refusal, match="seen enough"):
+            Preview(scene=scene, weather=options, output=tmp_path / "v.mp4").run()
     said = " ".join(capsys.readouterr().err.split())
-    assert effect == applied(read("heavy purple blorp rain that accumulates").request)
-    assert effect.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
+    rain, snow = made
+    assert rain == applied(read("heavy purple blorp rain that accumulates").request)
+    assert rain.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
     assert "understood rain = rainfall; heavy = amount 2; purple = colour (0.50, 0.00, 0.50)" in said
     assert "Ignored: blorp" in said
     assert "nothing will accumulate: rainfall wets surfaces" in said
-    turned = previewed("purple snow", intensity=0.7, exposure=0.01, **where)
-    assert (turned.emission.intensity, turned.appearance.exposure) == (0.7, 0.01)
-    assert turned.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
+    assert (snow.emission.intensity, snow.appearance.exposure) == (0.7, 0.01)
+    assert snow.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
 
 
-def test_particles_that_shall_not_gather_vanish_where_they_land():
+def test_particles_that_shall_not_accumulate_vanish_where_they_land():
     corners = torch.tensor([[-3.0, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]])
     floor = SurfaceMesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
     domain, clock = Domain((-2.0, -2.0, -0.2), (2.0, 2.0, 2.0)), Clock(fps=25.0, frames=40)

@@ -39,9 +39,7 @@ def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
     return best // len(cameras), best % len(cameras)
 
 
-def slow_path(
-    scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, views: tuple[int, int] | None = None
-) -> Cameras:
+def slow_path(scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, views: tuple[int, int] | None = None) -> Cameras:
     """Cameras of some frames of a slow path from one training view to another.
 
     The path spans `start + frames` frames, or more where the camera would turn by more than 3 degrees in a second.
