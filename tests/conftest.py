@@ -1,13 +1,52 @@
-"""Inputs that tests share: the real capture beside the repository, and a splatfacto run made of it."""
+"""Types checked while tests run, and inputs that tests share: the real capture, and a splatfacto run made of it.
+
+Every call of a function of the package is compared with its annotations, shapes included: what has other types raises a
+jaxtyping.TypeCheckError. This has to be set up before anything imports the package. Tests of how bad input is refused hand over
+what annotations forbid; they are marked `mistyped` and run without the comparison.
+"""
 
 from __future__ import annotations
 
+import ast
 import os
 from pathlib import Path
 
+import jaxtyping
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+KERNELS = ("numba.njit", "ti.kernel", "ti.func", "kernel", "inlined")
+"""Decorators whose functions are compiled: their annotations are those of a compiler, not of a value."""
+
+
+def holds_kernels(tree: ast.Module) -> bool:
+    """Whether a module defines a function that numba or Taichi compiles."""
+    functions = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    names = (ast.unparse(decorator).partition("(")[0] for function in functions for decorator in function.decorator_list)
+    return any(name in KERNELS for name in names)
+
+
+def checked_modules() -> list[str]:
+    """Modules whose types are checked: all with functions of their own, but those that hold kernels."""
+    paths = (path for path in sorted((ROOT / "pgsd_nerfstudio").rglob("*.py")) if path.name != "__init__.py")
+    return [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in paths
+        if not holds_kernels(ast.parse(path.read_text("utf-8")))
+    ]
+
+
+# The numeric tower lets a whole number stand for a float, as type checkers do.
+jaxtyping.install_import_hook(checked_modules(), "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+
+
+@pytest.fixture(autouse=True)
+def _mistyped(request: pytest.FixtureRequest):
+    """Leaves types unchecked in a test with the mark of that name."""
+    jaxtyping.config.update("jaxtyping_disable", request.node.get_closest_marker("mistyped") is not None)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -173,11 +173,11 @@ def test_frames_that_no_step_leads_to_are_refused_and_no_particles_are_no_error(
             field.at(frame, torch.zeros(1, 3, dtype=torch.float64))
     with pytest.raises(ValueError, match="positive size, got 0 m"):
         VelocityField.of(carried(shear), 0)
-    nobody = replace(falling(), **{name: getattr(falling(), name)[:0] for name in ("births", "ends", "collided", "positions")},
-                     offsets=torch.zeros(1, dtype=torch.int64))  # fmt: skip
+    nobody = falling().select(torch.zeros(0, dtype=torch.int64))
     assert not VelocityField.of(nobody).at(1, torch.ones(3, 3)).any()
 
 
+@pytest.mark.mistyped
 def test_there_are_two_motions():
     with pytest.raises(ValueError, match='"particle" or "field", got "grid"'):
         Rollout(falling(), looks(60), DynamicsField.for_history(falling()), motion="grid")

@@ -53,7 +53,7 @@ def test_an_unreadable_target_is_refused(target):
         Record("x", 1.0, "m", target=target, holds=True)
 
 
-def test_the_json_is_a_list_of_records_with_exactly_the_keys_of_the_design(tmp_path):
+def test_the_json_is_a_list_of_records_with_exactly_their_keys(tmp_path):
     write_records(
         tmp_path / "new" / "rows.json", [GOOD, Record("gpu", None, "ms", target="<= 5", source="no CUDA device here")]
     )
@@ -77,6 +77,7 @@ def test_another_json_is_not_read_as_records(tmp_path, text):
         read_records(tmp_path / "x.json")
 
 
+@pytest.mark.mistyped
 def test_numpy_scalars_become_plain_json_numbers():
     record = Record("x", np.float32(1.5), "m", error=np.float64(0.1), holds=np.bool_(True))
     assert type(record.value) is float and type(record.error) is float and record.holds is True

@@ -176,6 +176,7 @@ def test_baked_gaussians_look_like_the_moment_without_air():
     assert baked(None, floor()).colors.equal(floor().colors)
 
 
+@pytest.mark.mistyped
 def test_collided_particles_take_the_light_of_their_place():
     n = GRID**2
     exposure = answer(effect("snowfall")).exposure

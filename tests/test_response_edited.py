@@ -222,6 +222,7 @@ def test_no_change_can_still_learn():
     assert torch.allclose(edits.log_scale.grad, gaussians.scales)
 
 
+@pytest.mark.mistyped
 def test_a_change_of_other_gaussians_is_refused(scene):
     with pytest.raises(ValueError, match="for 5 Gaussians, found 288"):
         some_edits(5).applied(scene.gaussians, 1.0)
@@ -320,6 +321,7 @@ def test_five_of_them_in_a_row_end_the_fit(scene, pictures, monkeypatch):
 # --- bad input
 
 
+@pytest.mark.mistyped
 def test_what_cannot_be_fitted_is_refused(scene, pictures):
     with pytest.raises(ValueError, match="at least one edited picture, found none"):
         fit_edits(scene, [], progress=False)

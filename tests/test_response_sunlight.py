@@ -223,6 +223,7 @@ def test_too_few_points_or_nothing_that_casts_shadows_is_no_sun():
         ({"points": torch.full((5, 3), math.nan)}, "15 values of the points are NaN"),
     ],
 )
+@pytest.mark.mistyped
 def test_what_does_not_fit_together_is_refused(change, says):
     five = Lit(torch.zeros(5, 3), torch.zeros(5, 3), torch.ones(5), SurfaceMesh.empty())
     with pytest.raises(ValueError, match=says):

@@ -38,6 +38,7 @@ def test_beside_moving_ones_the_others_stand_still():
     assert torch.equal(joined.means, torch.cat([still.means, moving.means]))
 
 
+@pytest.mark.mistyped
 def test_displacements_of_another_number_are_refused():
     with pytest.raises(ValueError, match=r"Gaussians.displacements must have shape \(3, 3\), found \(2, 3\)"):
         Gaussians(**{**some(3, moving=False).tensors, "displacements": torch.zeros(2, 3)})

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 GRAVITY = 9.81  # m/s^2, in all motion here; the fits in laws.fall_speeds were made with the standard 9.80665
@@ -44,7 +44,7 @@ class Bodies:
     """Turns about the surface normal after landing."""
     represents: Float[ndarray, " n"]
     """Real particles that each particle represents."""
-    kinds: Int[ndarray, " n"]
+    kinds: UInt8[ndarray, " n"]
     """Bits SPLASHED, SLID and DENSE."""
 
     def __len__(self) -> int:

@@ -96,7 +96,7 @@ class Patches:
         turned = modes * torch.polar(torch.ones_like(rates), rates * seconds).to(modes)
         return torch.fft.irfftn(turned, s=(NODES,) * 3, norm="forward")
 
-    def _texture(self, seconds: float, like: Tensor) -> Float[Tensor, "n+1 n+1 n+1"]:
+    def _texture(self, seconds: float, like: Tensor) -> Float[Tensor, "m m m"]:
         """Density at the nodes, with the first slice along each axis repeated at its end. The texture of the last moment is
         cached."""
         made = self._made[-1] if self._made else None

@@ -65,7 +65,7 @@ class DistanceGrid:
         lower, size = np.asarray(lower, np.float64), np.asarray(upper, np.float64) - np.asarray(lower, np.float64)
         if not ((size > 0).all() and cell > 0 and band >= 1):
             raise ValueError(f"a distance grid needs a box, cell > 0 and band >= 1, got {size} m, {cell:g} m and {band}")
-        shape = tuple(np.ceil(size / cell - 1e-6).astype(int) + 1)
+        shape = tuple((np.ceil(size / cell - 1e-6).astype(int) + 1).tolist())
         if math.prod(shape) > MAX_POINTS:
             raise ValueError(f"{shape} points are more than {MAX_POINTS:,}: take cells larger than {cell:g} m or a smaller box")
         reach, values = cell * band, np.full(shape, cell * band, np.float32)

@@ -118,7 +118,7 @@ def without_silhouettes(
 
 def _without_crumbs(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "f 3"], size: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """The mesh without small components and without vertices that no triangle uses."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -137,7 +137,7 @@ def _without_crumbs(
 
 def _in_order(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
     """The mesh with only the vertices that its triangles use, in an order that does not depend on threads."""
     used, renumbered = np.unique(triangles, return_inverse=True)
     vertices, triangles = vertices[used].astype(np.float32), renumbered.reshape(-1, 3)

@@ -35,6 +35,9 @@ NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance 
 NEAR = 1.25  # radius of the finely fused ball around what the cameras look at, in radii
 MAX_TRIANGLES = {"near": 330_000, "far": 70_000}
 
+Points = Float[Tensor | np.ndarray, "n 3"]
+"""Places or directions, of any float type."""
+
 
 class Hits(NamedTuple):
     """First hits of rays on the surface."""
@@ -75,7 +78,7 @@ class SurfaceMesh:
             return torch.zeros(2, 3)
         return torch.stack(self.vertices.aminmax(dim=0))
 
-    def cast(self, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Hits:
+    def cast(self, origins: Points, directions: Points) -> Hits:
         """First hits of rays, from either side of the surface.
 
         Args:
@@ -89,7 +92,7 @@ class SurfaceMesh:
         distance = torch.from_numpy(found["t_hit"].numpy())
         return Hits(distance, self._normals_at(found, torch.isfinite(distance)))
 
-    def closest(self, points: Float[Tensor, "n 3"]) -> Closest:
+    def closest(self, points: Points) -> Closest:
         """Nearest points of the surface, however far away.
 
         Args:
@@ -251,7 +254,7 @@ def _fuse_within(
         fusion = replace(fusion, voxel=fusion.voxel * 1.05 * (len(triangles) / budget) ** 0.5)
 
 
-def queries(*parts: Float[Tensor, "n 3"]) -> Any:
+def queries(*parts: Points) -> Any:
     """Points, or origins and directions, as the tensor that Open3D expects."""
     columns = [torch.as_tensor(part).detach().float().cpu() for part in parts]
     return open3d().core.Tensor(torch.cat(columns, dim=1).contiguous().numpy())

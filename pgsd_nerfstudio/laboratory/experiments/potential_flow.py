@@ -92,7 +92,7 @@ def _influence(surface: Surface) -> tuple[Float[ndarray, "n n"], Float[ndarray, 
     return along, turning
 
 
-def _elements(points: Surface, first: Surface, second: Surface) -> list[Float[ndarray, "n m"]]:
+def _elements(points: Surface, first: Float[ndarray, "m 2"], second: Float[ndarray, "m 2"]) -> list[Float[ndarray, "n m"]]:
     """Integrals over straight elements, as seen from points, weighted to either end: of log r, and of its outward slope."""
     edge = second - first
     length = np.hypot(*edge.T)
@@ -146,7 +146,9 @@ def _advanced(surface: Surface, potential: ndarray, velocity: Surface, rise: nda
     return surface, potential
 
 
-def _respaced(surface: Surface, potential: ndarray, spacing: float) -> tuple[Surface, ndarray]:
+def _respaced(
+    surface: Surface, potential: Float[ndarray, " n"], spacing: float
+) -> tuple[Float[ndarray, "m 2"], Float[ndarray, " m"]]:
     """Nodes moved along the surface: closer where the water is thin, and towards the tip."""
     x, y, value, at = _curves(surface, potential)
     along = np.linspace(0, at[-1], 1000)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from numpy import ndarray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -171,12 +171,12 @@ def undisturbed_winds(shape: tuple[int, int, int], profile: Float[ndarray, " z"]
     return x, y, z
 
 
-def _flat(faces: Sequence[ndarray]) -> Float[ndarray, "... f"]:
+def _flat(faces: Sequence[ndarray]) -> Shaped[ndarray, "... f"]:
     """Values of all faces in one row."""
     return np.concatenate([values.reshape(*values.shape[:-3], -1) for values in faces], -1)
 
 
-def _faces(flat: Float[ndarray, "... f"], like: Faces) -> Faces:
+def _faces(flat: Shaped[ndarray, "... f"], like: Faces) -> Faces:
     """Values in one row put back onto faces of the shapes of `like`."""
     x, y, z = np.split(flat, np.cumsum([values.size for values in like])[:2], -1)
     lead = flat.shape[:-1]

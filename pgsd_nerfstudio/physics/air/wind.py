@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,7 @@ from pgsd_nerfstudio.physics.laws.boundary_layer import calming, law_of_the_wall
 GUST_WAVES = 6
 
 
+@runtime_checkable
 class Obstructed(Protocol):
     """Change of a wind by obstacles; `deflection.Deflection` has it."""
 

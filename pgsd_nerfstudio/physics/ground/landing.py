@@ -9,7 +9,7 @@ and with a linearly falling chance in between. A particle that does not stay sli
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ ROUGH = 0.35  # rise per run up to which the neighbourhood counts as the same su
 GRAZING = 0.2  # smallest sine of the angle between path and surface with which a path is shortened by the cover
 
 
+@runtime_checkable
 class Raised(Protocol):
     """A cover on the surface; `cover.Cover` has it."""
 

@@ -85,7 +85,7 @@ class WetnessGrid:
         wetting = wetting or Wetting()
         corners = triangle_corners(surface).astype(np.float64)
         x, y, z = (math.ceil(edge / wetting.cell) + 1 for edge in domain.size)
-        return WetnessGrid(sample_triangles(corners, wetting.cell / 2), np.asarray(domain.lower), (x, y, z), wetting)
+        return WetnessGrid(sample_triangles(corners, wetting.cell / 2), np.asarray(domain.lower, float), (x, y, z), wetting)
 
     def __len__(self) -> int:
         return len(self.keys)

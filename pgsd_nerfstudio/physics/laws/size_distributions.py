@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,7 @@ Speed = Callable[[Float[ndarray, " n"]], Float[ndarray, " n"]]
 """Terminal speed in m/s of particles with diameters in metres."""
 
 
+@runtime_checkable
 class Distribution(Protocol):
     """Particles per m^3 of air over their diameter, between two diameters."""
 

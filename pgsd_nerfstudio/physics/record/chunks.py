@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState, with_prefix, without_prefix
@@ -40,12 +40,12 @@ class Chunk:
     """Orientation while active, wxyz."""
     kind_ids: Int[ndarray, " k"]
     """Particles whose kinds changed in this chunk."""
-    kind_bits: Int[ndarray, " k"]
+    kind_bits: UInt8[ndarray, " k"]
     """Bits of all kinds of each of them."""
     ended_ids: Int[ndarray, " e"]
     ended_frames: Int[ndarray, " e"]
     """Exclusive end of the active frames."""
-    ended_how: Int[ndarray, " e"]
+    ended_how: UInt8[ndarray, " e"]
     """LANDED, ABSORBED, LEFT or UNSEEN."""
     rest_ids: Int[ndarray, " h"]
     """Particles that landed; the other rest arrays are as in `ParticleHistory`."""

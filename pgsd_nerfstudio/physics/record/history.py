@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pgsd_nerfstudio.physics.record.codec import Steps, decode, encode
@@ -58,8 +58,8 @@ class ParticleHistory:
     """Metres."""
     represents: Float[Tensor, " p"]
     """Real particles that each particle represents."""
-    kinds: Int[Tensor, " p"]
-    """uint8 bits: 1 the particle is a splash droplet, 2 it has slid, 4 it has been dense matter."""
+    kinds: UInt8[Tensor, " p"]
+    """Bits: 1 the particle is a splash droplet, 2 it has slid, 4 it has been dense matter."""
     fps: float
     """Frames per second."""
     frames: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Integer
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.bodies import LANDED, Bodies, RunState, random_orientations
@@ -109,5 +109,5 @@ class Log:
         )
 
 
-def _joined(parts: list[Int[ndarray, " n"]], dtype: type) -> Int[ndarray, " n"]:
+def _joined(parts: list[Integer[ndarray, " _"]], dtype: type) -> Integer[ndarray, " n"]:
     return np.concatenate([np.zeros(0, dtype), *parts])
