@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -81,6 +81,7 @@ class DistillationConfig:
         return {"sds": self.guidance_scale, "bridge": self.bridge_scale}.get(rule, self.nfsd_scale)
 
 
+@runtime_checkable
 class Denoiser(Protocol):
     """What distillation needs of a video prior."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -84,6 +84,7 @@ class Prompts:
         return {role: getattr(self, role) for role in roles_of(variant)}
 
 
+@runtime_checkable
 class Listener(Protocol):
     """What encodes texts."""
 
