@@ -67,7 +67,7 @@ class Froxels:
 
         return float(root_scalar(excess, bracket=(1e-9, 600 / self.slices)).root)
 
-    def edges(self, like: Tensor) -> Float[Tensor, " s+2"]:
+    def edges(self, like: Tensor) -> Float[Tensor, " {self.slices}+2"]:
         """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
         within = self.nearest / math.expm1(self.growth) * torch.expm1(self.growth * torch.arange(self.slices + 1).to(like))
         return torch.cat([within, BEYOND * within[-1:]])
@@ -171,7 +171,7 @@ class Medium:
     @torch.no_grad()
     def _depths(
         self, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
-    ) -> Float[Tensor, "s+2 rows columns"]:
+    ) -> Float[Tensor, "{self.froxels.slices}+2 rows columns"]:
         """Optical depth at the edges of the slices along each ray of the fan; that of the last view is kept."""
         view = viewmat.detach(), K.detach(), width, height
         kept = self._sampled  # read once: another thread may put its own view there

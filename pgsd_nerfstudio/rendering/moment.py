@@ -7,7 +7,7 @@ A rasterizer is handed a frozen scene once. What rain, snow and haze make of it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -38,6 +38,7 @@ class Viewpoint(NamedTuple):
         return torch.linalg.inv(self.viewmat.double())[:3, 3].to(self.viewmat)
 
 
+@runtime_checkable
 class Moment(Protocol):
     """What a rasterizer asks of a moment; everything in scene units."""
 

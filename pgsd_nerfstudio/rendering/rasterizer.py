@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -82,6 +82,7 @@ class Rendering(NamedTuple):
     """Share of the light that comes from Gaussians, 0..1."""
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """Renders one frozen scene, and with it what moves."""
 
