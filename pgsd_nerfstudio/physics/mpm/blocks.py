@@ -31,7 +31,8 @@ from pgsd_nerfstudio.physics.mpm.layout import (
     read3,
 )
 
-# Columns per block: particles, where they begin in the order, the number of its halo, whether it is touched, to be woken.
+# Columns per block: number of particles, their first place in the order, number of its halo, whether it is touched, whether
+# its particles must wake.
 COUNT, BEGIN, SLOT, MARK, WAKES = 0, 1, 2, 3, 4
 OCCUPIED, TOUCHED = 0, 1  # columns of the lists: blocks with particles, blocks within their reach
 N_OCCUPIED, N_TOUCHED, N_PARTICLES, N_WAKING = 0, 1, 2, 3  # in heads; the last is 0 or 1
@@ -72,7 +73,7 @@ def sort(
     by: int,
     bz: int,
 ):
-    """Order the listed particles by block, stably, and list the blocks that they are in and that they touch."""
+    """Order the listed particles by block, stably, and list the blocks that they are in and the blocks that they touch."""
     for a in range(count):
         p = listed[a]
         block = -1

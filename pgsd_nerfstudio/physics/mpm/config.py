@@ -14,17 +14,17 @@ class Sleep:
     speed: float = 0.02
     """Speed in m/s below which a particle may fall asleep."""
     frames: int = 5
-    """Consecutive steps during which it must be that slow and lie on an obstacle or on resting matter."""
+    """Consecutive steps during which a particle must be that slow and touch an obstacle or resting matter."""
     wake_speed: float = 0.2
-    """Speed in m/s from which resting matter wakes: that which it and what comes upon it would have together, did they not
-    part. Fresh snow at 1 m/s does not wake what it falls on, a snowball does. Infinity: it only wakes when told to."""
+    """Speed in m/s from which resting matter wakes: the common speed of resting and arriving matter if the two stayed together.
+    Fresh snow at 1 m/s does not wake the snow below it, a snowball does. Infinity: resting matter wakes only by `Mpm.wake`."""
 
     def __post_init__(self) -> None:
         if not self.speed >= 0 or self.frames < 1:
             raise ValueError(f"sleep needs a speed >= 0 and at least one frame, got {self.speed:g} m/s and {self.frames}")
         if not self.wake_speed > self.speed:
             raise ValueError(
-                f"what wakes matter must be faster than what may fall asleep, got {self.wake_speed:g} and {self.speed:g} m/s"
+                f"the wake speed must exceed the speed of falling asleep, got {self.wake_speed:g} and {self.speed:g} m/s"
             )
 
 
@@ -43,8 +43,8 @@ class MpmConfig:
     max_substeps: int = 5000
     """Substeps that one step may need before it is refused."""
     max_cells: int = 50_000_000
-    """Grid nodes that may be allocated; each takes 16 bytes (f32), and 24 for each part of the obstacle. What no particle comes
-    near is never touched, but the obstacle is."""
+    """Grid nodes that may be allocated; each takes 16 bytes (f32), and 24 for each part of the obstacle. Nodes far from
+    all particles cost no time, but the obstacle fills them once."""
     sleep: Sleep | None = None
     """When particles come to rest and no longer cost time; None: never."""
     precision: Literal["f32", "f64"] = "f32"

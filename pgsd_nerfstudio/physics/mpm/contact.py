@@ -1,7 +1,7 @@
-"""What happens at obstacles and at matter that rests: on the nodes of the grid, and for each particle by itself.
+"""Contact with obstacles and with resting matter, on the nodes of the grid and for each particle by itself.
 
-Nodes: Coulomb friction on the relative velocity, separation is free. Particles: one that still ends inside is put back onto
-the surface, so that nothing passes a plate, however fast.
+Nodes have Coulomb friction on the relative velocity and separate freely. A particle that still ends inside an obstacle is put
+back onto the surface, so that no particle passes a plate, however fast.
 """
 
 # What Taichi compiles is not what Python would run, which is all that a type checker can see.
@@ -32,8 +32,8 @@ from pgsd_nerfstudio.physics.mpm.layout import (
     read3,
 )
 
-HELD = 0.5  # share of a node's volume that rests, from which the node counts as solid
-FELT = 0.05  # share from which a particle counts as lying on resting matter
+HELD = 0.5  # resting share of a node's volume from which the node counts as solid
+FELT = 0.05  # share from which a particle counts as touching resting matter
 
 
 @ti.func
@@ -54,7 +54,7 @@ def slid(velocity, normal, friction):
 
 @ti.func
 def cell_at(position, inv_dx, by, bz):
-    """Where in its cell of nodes a position lies, 0-1 on each axis, and the terms of the rows of the cell's corners."""
+    """Place of a position in its cell of nodes, 0-1 on each axis, and the terms of the rows of the cell's corners."""
     at = position * inv_dx
     cell = ti.cast(ti.floor(at), ti.i32)
     return at - cell, axis_terms(cell + MARGIN, by, bz)
@@ -70,7 +70,7 @@ def corner(part, terms, q):
 
 @ti.func
 def trilinear(rows: ti.template(), position, column, inv_dx, by, bz):
-    """What a column of the nodes says at a position."""
+    """Value of a column of the nodes at a position."""
     part, terms = cell_at(position, inv_dx, by, bz)
     total = 0.0
     for q in range(8):
@@ -119,7 +119,7 @@ def nearest(wall: ti.template(), parts, position, inv_dx, by, bz):
 
 @ti.func
 def moved(row, wall: ti.template(), rest: ti.template(), node, parts, resting, wake_speed, dt, gravity):
-    """Velocity of a node from its [mass, momentum], after gravity, obstacles and matter at rest; and whether that must wake."""
+    """Velocity of a node from its [mass, momentum], after gravity, obstacles and resting matter; and whether that must wake."""
     mass, wakes = row[0], 0
     v = ti.Vector([row[1], row[2], row[3]]) / mass + dt * gravity
     for part in range(parts):
@@ -128,7 +128,7 @@ def moved(row, wall: ti.template(), rest: ti.template(), node, parts, resting, w
             normal = ti.Vector([wall[node, first + 1], wall[node, first + 2], wall[node, first + 3]])
             v = slid(v, normal, wall[node, first + 4])
     if resting == 1 and rest[node, 0] >= HELD:
-        # The speed that both would have together, did they not part. What wakes is met with its momentum, not held still.
+        # The common speed of both if they stayed together. Waking matter takes part with its momentum and is not held.
         if mass * v.norm() > wake_speed * (mass + rest[node, 1]):
             wakes = 1
         else:
@@ -152,17 +152,17 @@ def fall_asleep(
     by: int,
     bz: int,
 ):
-    """Count the frames during which a particle was slow and lay on something; after enough of them it rests."""
+    """Count the frames during which a particle was slow and touched a wall or resting matter; after enough of them it rests."""
     for a in range(count):
         p = listed[a]
         if tags[p][STATE] == ACTIVE:
             x = read3(state, p, X)
-            lies = 0
+            touches = 0
             if nearest(wall, parts, x, 1.0 / dx, by, bz) < dx:
-                lies = 1
+                touches = 1
             if resting == 1 and trilinear(rest, x, 0, 1.0 / dx, by, bz) > FELT:
-                lies = 1
-            if lies == 1 and read3(state, p, V).norm() < slow:
+                touches = 1
+            if touches == 1 and read3(state, p, V).norm() < slow:
                 tags[p][QUIET] += 1
                 if tags[p][QUIET] >= frames:
                     tags[p][STATE] = RESTING

@@ -1,4 +1,4 @@
-"""Where things lie in memory: one row per particle, one row per grid node, nodes in blocks of 4 x 4 x 4.
+"""Layout in memory: one row per particle, one row per grid node, nodes in blocks of 4 x 4 x 4.
 
 A particle's row is read and written as a whole, so it is one piece of memory. Positions are relative to the lower corner of
 the domain, where single precision is finest. Node (i, j, k) lies at ((i, j, k) - MARGIN) * dx from that corner; its row
@@ -98,7 +98,7 @@ def block_of(base, by, bz):
 
 @ti.func
 def block_at(block, by, bz):
-    """Where a block lies, counted in blocks."""
+    """Place of a block, counted in blocks."""
     return ti.Vector([block // (by * bz), (block // bz) % by, block % bz])
 
 

@@ -1,8 +1,8 @@
-"""Stretches close to none: their functions as power series, without eigenvectors.
+"""Functions of small stretches as power series, without eigenvectors.
 
-Snow that lies and sand that flows are strained by a few percent at most. Then root, logarithm and exponential of a symmetric
-matrix are a handful of products of matrices, which costs a fifth of finding its principal axes; where a principal value
-matters only by whether it exceeds a bound, Gershgorin's discs answer. What lies beyond `SMALL` takes the general way.
+Lying snow and flowing sand are strained by a few percent at most. Then root, logarithm and exponential of a symmetric matrix
+are a handful of products of matrices, which costs a fifth of finding its principal axes; if only a bound of the principal
+values matters, Gershgorin's discs answer. Strains beyond `SMALL` take the general way.
 
 Symmetric matrices are vectors of six: xx, xy, xz, yy, yz, zz.
 """
@@ -22,7 +22,7 @@ def six(matrix):
 
 @ti.func
 def excess(f):
-    """F F^T - 1: twice the strain, seen from outside."""
+    """F F^T - 1: twice the strain in spatial axes."""
     return six(f @ f.transpose() - ti.Matrix.identity(float, 3))
 
 
@@ -36,7 +36,7 @@ def discs(a):
 
 @ti.func
 def product(a, b):
-    """Of two matrices that commute."""
+    """Product of two matrices that commute."""
     return ti.Vector(
         [
             a[0] * b[0] + a[1] * b[1] + a[2] * b[2],

@@ -1,8 +1,8 @@
-"""What matter meets: signed distance, outward normal and friction in space.
+"""Obstacles as signed distance, outward normal and friction in space.
 
-Obstacles stand still and feel nothing. An obstacle has parts, which act one after the other: in the edge where floor and wall
-meet, matter may move into neither. A plate must be at least two grid cells thick: the sides of a thinner one share nodes, or
-lie between them, and fast matter passes. What is known to be thinner is refused; `grown` makes it thicker.
+Obstacles stand still and feel no force. An obstacle has parts, which act one after the other: in the edge between floor and
+wall, matter may move into neither. A plate must be at least two grid cells thick: the sides of a thinner one share nodes, or
+lie between them, and fast matter passes. A plate that is known to be thinner is refused; `grown` makes it thicker.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class Part:
     sample: Sampler
     """Takes points [n, 3] in metres to distances [n] (negative inside), outward unit normals [n, 3] and frictions [n]."""
     thickness: float = math.inf
-    """Of its thinnest plate, in metres, as far as that is known."""
+    """Thickness of the thinnest plate in metres, as far as it is known."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
     """A solid body; made by `plane`, `box`, `room` or `from_grid`, and joined with `|`.
 
-    Friction is Coulomb's coefficient; infinity sticks: what touches such a surface neither slides nor leaves.
+    Friction is Coulomb's coefficient; infinity sticks: matter at such a surface neither slides nor leaves.
     """
 
     parts: tuple[Part, ...]
@@ -86,7 +86,7 @@ class Obstacle:
             )
 
     def at_nodes(self, blocks: tuple[int, int, int], lower: Point, dx: float) -> Float[Tensor, "nodes columns"]:
-        """What every part says at the nodes of a grid of blocks, in the order of its rows: the columns that `layout` names."""
+        """Values of every part at the nodes of a grid of blocks, in the order of its rows: the columns that `layout` names."""
         if not self.parts:
             return torch.zeros(1, WALL)
         _, by, bz = blocks

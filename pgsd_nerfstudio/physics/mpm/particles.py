@@ -1,4 +1,4 @@
-"""All particles of a simulation: storage that grows, emission, who is active, and whether numbers are still numbers."""
+"""All particles of a simulation: storage that grows, emission, the list of active ones, and the check for finite numbers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Particles:
         v: Float[Tensor, "n 3"],
         f: Float[Tensor, "n 3 3"],
         volume: Float[Tensor, " n"],
-        removed: Tensor,  # bool [n]: those that only count
+        removed: Tensor,  # bool [n]: particles that are outside from the start
         material: Matter,
     ) -> Tensor:
         """Append particles; returns their ids."""
@@ -100,7 +100,7 @@ class Particles:
         self.relist()
 
     def relist(self) -> None:
-        """Note anew who is active."""
+        """List the active particles anew."""
         condition = self.tags[: self.count, STATE]
         self.active = torch.nonzero(condition == ACTIVE)[:, 0].to(torch.int32)
         self.signal[: self.count][condition == REMOVED] = 0

@@ -1,4 +1,4 @@
-"""What a simulation holds: masses by state, momenta, energies. Everything is summed in double precision."""
+"""Sums over a simulation: masses by state, momenta, energies. Everything is summed in double precision."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Report:
     """Sums over all particles; momenta and energies over those that have not left the domain."""
 
     seconds: float
-    """Simulated so far."""
+    """Simulated time so far."""
     substeps: int
     active: int
     resting: int
@@ -38,7 +38,7 @@ class Report:
 
     @property
     def mass(self) -> float:
-        """kg that were ever emitted."""
+        """Mass of all particles ever emitted, kg."""
         return self.mass_active + self.mass_resting + self.mass_removed
 
     @property
@@ -57,7 +57,17 @@ class Report:
         seconds: float,
         substeps: int,
     ) -> Report:
-        """Sum up particles."""
+        """Sum over particles.
+
+        Args:
+            state: rows of the particles, as `layout` describes them.
+            tags: their whole numbers.
+            lower: lower corner of the domain, m.
+            gravity: m/s^2.
+            dx: spacing of the grid, m.
+            seconds: simulated time so far.
+            substeps: substeps so far.
+        """
         condition = tags[:, STATE]
         here = condition != REMOVED
         rows = state.double()

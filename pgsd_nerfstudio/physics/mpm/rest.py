@@ -1,8 +1,8 @@
-"""Matter at rest: who falls asleep, what the grid knows of it, and who wakes.
+"""Matter at rest: which particles fall asleep, how the grid accounts for them, and which particles wake.
 
-What rests costs no time. It holds the nodes that it fills by half still, as an obstacle would. Where matter comes upon it so
-fast that both together would move at `Sleep.wake_speed`, it wakes in the same substep, block by block, and the blow goes on
-into it; slower matter is stopped. Waking takes one pass over the tags of all particles and the stress of those that woke.
+Resting particles cost no time. They hold still the nodes that they fill by half, as an obstacle does. If matter hits them so
+fast that both together would move at `Sleep.wake_speed`, they wake in the same substep, block by block, and take up the blow;
+slower matter is stopped. Waking takes one pass over the tags of all particles and the stress of those that woke.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class Rest:
         self.shares = torch.zeros(math.prod(blocks.shape) * CELLS if sleep else 1, REST, **real)
         """Share of the node's volume, and mass in kg."""
         self.any = False
-        """Whether something rests."""
+        """Whether any particle rests."""
         self.wake_speed = sleep.wake_speed if sleep else math.inf
 
     def settle(self, particles: Particles, wall: Tensor, parts: int) -> None:
-        """Put to sleep what has been slow for long enough and lies on something."""
+        """Put particles to sleep that have been slow for long enough and touch an obstacle or resting matter."""
         p, (_, by, bz) = particles, self._blocks.shape
         if self._sleep is None or len(p.active) == 0:
             return
@@ -48,7 +48,7 @@ class Rest:
             self.any = True
 
     def wake_marked(self, particles: Particles) -> None:
-        """Wake what rests in blocks that were met fast enough in this substep."""
+        """Wake the resting particles of blocks that matter hit fast enough in this substep."""
         if not (self.any and int(self._blocks.heads[N_WAKING])):
             return
         tags, marks = particles.tags[: particles.count], self._blocks.table[:, WAKES]
@@ -65,7 +65,7 @@ class Rest:
         self.any = bool((p.tags[: p.count, STATE] == RESTING).any())
         if self.any:
             self._deposit(p, ids.to(p.active), -1.0)
-        else:  # the exact end of what many differences would end in
+        else:  # exactly zero, where the many differences would leave a rounding error
             self.shares.zero_()
         p.relist()
         p.respond(ids)

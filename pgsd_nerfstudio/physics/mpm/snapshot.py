@@ -1,8 +1,8 @@
 """All that the next step depends on, as plain tensors: what `Mpm.snapshot` gives and `Mpm.restore` takes.
 
-Particles are kept bit for bit, so that a run that goes on from a snapshot is the run that was never interrupted. What the grid
-holds is worked out anew in every substep and is left out, but for the volume at rest, of which only nodes that hold some are
-kept. Config, domain and obstacle are not in it; sums that tell them apart are, and a snapshot of another setting is refused.
+Particles are kept bit for bit, so that a run that goes on from a snapshot is the run that was never interrupted. The grid is
+computed anew in every substep and is left out, except for the volume at rest, of which only the nodes that hold some are kept.
+Config, domain and obstacle are not in it; sums that tell them apart are, and a snapshot of another setting is refused.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from pgsd_nerfstudio.physics.mpm.materials import Elastic, Matter, Sand, Snow, Water
 
 KEYS = ("state", "tags", "signal", "materials", "rest_nodes", "rest", "seconds", "substeps", "setting")
-"""What a snapshot holds."""
+"""Keys of a snapshot."""
 _KINDS: dict[str, type[Matter]] = {kind.name: kind for kind in (Water, Elastic, Snow, Sand)}
 
 
@@ -29,7 +29,7 @@ def materials_as_tensor(materials: Sequence[Matter]) -> Tensor:
 
 
 def materials_from(tensor: Tensor) -> list[Matter]:
-    """What `materials_as_tensor` was given.
+    """Materials from the bytes of `materials_as_tensor`.
 
     Raises:
         ValueError: a kind or number is not one of a material.

@@ -72,7 +72,7 @@ class Mpm:
                 counts as removed.
             velocities: m/s.
             volume: m^3 of each particle at rest, from the density of the sampling (not from the grid).
-            deformation: elastic deformation gradients; None: none. What starts under its own weight starts calmer with it.
+            deformation: elastic deformation gradients; None: none. Matter under its own weight starts calmer with them.
 
         Raises:
             ValueError: shapes do not fit, a value is not finite, or a volume is not positive.
@@ -128,7 +128,7 @@ class Mpm:
         return done
 
     def wake(self) -> None:
-        """Make all resting particles active again. What is met fast enough (`Sleep.wake_speed`) wakes by itself."""
+        """Make all resting particles active again. Matter that is hit fast enough (`Sleep.wake_speed`) wakes by itself."""
         self._rest.wake(self._particles, torch.nonzero(self.states == RESTING)[:, 0])
 
     def snapshot(self) -> dict[str, Tensor]:
@@ -146,7 +146,7 @@ class Mpm:
         }
 
     def restore(self, snapshot: Mapping[str, Tensor]) -> None:
-        """Go on from a snapshot; what was simulated here before is forgotten. The steps that follow are bit for bit those that
+        """Go on from a snapshot and forget all that was simulated here before. The steps that follow are bit for bit those that
         would have followed there.
 
         Raises:
@@ -171,7 +171,7 @@ class Mpm:
 
     @property
     def positions(self) -> Float[Tensor, "n 3"]:
-        """m; a copy, as are the other read-outs (`.numpy(force=True)` for arrays). Of a removed particle: where it left."""
+        """m; a copy, as are the other read-outs (`.numpy(force=True)` for arrays). A removed particle stays where it left."""
         x = self._rows(X, 3)
         return x + x.new_tensor(self.domain.lower)
 

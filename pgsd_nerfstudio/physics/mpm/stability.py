@@ -26,13 +26,13 @@ def longest_substep(particles: Particles, config: MpmConfig, seconds: float) -> 
     reach = config.courant * config.dx
     longest = reach / max(fastest, 1e-30)
     pull = math.sqrt(sum(g * g for g in config.gravity))
-    if pull > 0:  # for what starts from rest and has no stiffness to speak of
+    if pull > 0:  # for matter that starts from rest and has hardly any stiffness
         longest = min(longest, math.sqrt(reach / pull))
     return min(longest, config.max_dt or math.inf)
 
 
 def refusal(particles: Particles, config: MpmConfig, seconds: float, needed: int, dt: float) -> Unstable:
-    """What to raise where a step of `seconds` would need too many substeps of dt."""
+    """The error to raise if a step of `seconds` needs too many substeps of dt."""
     p = particles
     worst = int(p.signal[: p.count].argmax())
     speed = float(p.state[worst, V : V + 3].norm())
