@@ -1,9 +1,9 @@
 """Motion without simulation: Gaussians spread over the box and moved by a network of place and time alone.
 
 The paper's ablation "w/o Motion": in place of its 4D Gaussian splatting (Wu et al. 2024, a deformation of canonical Gaussians
-by time) the same backbone and encodings as the field's, so that nothing differs but where motion comes from. No births, no
-landings, no recurrence. A DeformedCloud is used like a Rollout; the terms xyz, vel and rot then hold it to where it was spread,
-and are to be left out (RegularizationWeights.without) for the ablation as published.
+by time) the same backbone and encodings as the field's, so that only the source of motion differs. There are no births, no
+landings and no recurrence. A DeformedCloud is used like a Rollout; the terms xyz, vel and rot then hold it to its first places
+and must be left out (RegularizationWeights.without) for the ablation as published.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 @dataclass(frozen=True, kw_only=True)
 class DeformationConfig:
-    """How far a Gaussian may come from how it was spread."""
+    """Bounds of a Gaussian's displacement and turn."""
 
     reach: float = 0.5
     """Largest displacement per axis as a share of the box along it: half the box, so that one can fall through a good part."""
@@ -44,7 +44,13 @@ class Deformation(nn.Module):
     box: Tensor
 
     def __init__(self, box: Float[Tensor, "2 3"], frames: int, config: DeformationConfig | None = None) -> None:
-        """`box`: corners of the domain in metres."""
+        """Set up with zero heads.
+
+        Args:
+            box: corners of the domain in metres.
+            frames: length of the sequence.
+            config: bounds of the deformation; None: the defaults.
+        """
         super().__init__()
         self.frames, self.config = frames, config or DeformationConfig()
         self.register_buffer("box", box.detach().clone().float())
@@ -53,7 +59,7 @@ class Deformation(nn.Module):
     def forward(
         self, position: Float[Tensor, "n 3"], frame: int
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Change]:  # m, rad about the particle's own axes
-        """Displacement, rotation vector and change of look at a frame, of what was spread at `position` (metres)."""
+        """Displacement, rotation vector and change of look at a frame, of Gaussians spread at `position` (metres)."""
         out = self.net(fourier(within(self.box, position)), sinusoidal(frame / self.frames, self.box))
         low, high = self.box
         change = Change(out["opacity"][:, 0], LOG_SCALE_BOUND * out["scale"], out["rgb"])
@@ -61,7 +67,13 @@ class Deformation(nn.Module):
 
 
 def scattered(box: Float[Tensor, "2 3"], like: ParticleHistory, count: int, *, seed: int = 0) -> ParticleHistory:
-    """`count` particles at random places of `box` (metres), in the air and at rest in all frames; sizes as those of `like`.
+    """Particles at random places of a box, active and unmoved in all frames.
+
+    Args:
+        box: corners in metres.
+        like: particles to take sizes, orientations and the number of frames from.
+        count: number of particles.
+        seed: of places and sizes.
 
     Raises:
         ValueError: there is nothing to scatter, or no particle to take a size from.
@@ -108,16 +120,22 @@ class DeformedCloud(GaussianSequence):
     def __init__(
         self, history: ParticleHistory, look: InitialLook, deformation: Deformation, learned_look: LearnedLook | None = None
     ) -> None:
-        """`history` as `scattered` makes it; all parts must be on one device.
+        """Set up without evaluating anything.
+
+        Args:
+            history: particles as `scattered` makes them.
+            look: initial look of all particles.
+            deformation: the network.
+            learned_look: the shift of the look that all particles share; None means none.
 
         Raises:
-            ValueError: a particle is not in the air in all frames.
+            ValueError: a particle is not active in all frames.
         """
-        flying = (history.births == 0) & (history.ends == history.frames)
-        if not bool(flying.all()):
+        active = (history.births == 0) & (history.ends == history.frames)
+        if not bool(active.all()):
             raise ValueError(
-                f"a deformed cloud has neither births nor landings, but {int((~flying).sum())} of {len(history)} particles are "
-                f"not in the air in all {history.frames} frames"
+                f"a deformed cloud has neither births nor landings, but {int((~active).sum())} of {len(history)} particles are "
+                f"not active in all {history.frames} frames"
             )
         super().__init__(history, look, learned_look)
         self.deformation = deformation

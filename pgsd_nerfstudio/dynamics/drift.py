@@ -1,4 +1,4 @@
-"""How far what is rendered lies from what was simulated, and how much of that training clips show."""
+"""Distance of rendered from simulated positions, and the share of it that training clips show."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def drift(frames: Iterable[RolloutFrame]) -> float:
 
 
 class Gap(NamedTuple):
-    """How far clips are from what they are cut from; metres."""
+    """Drift of clips against that of the whole roll-out; metres."""
 
     clips: float
     """Drift of the clips as training sees them."""
@@ -32,13 +32,13 @@ class Gap(NamedTuple):
 def gaps(
     rollout: Rollout, windows: Sequence[tuple[int, int]], begins: Sequence[Begin] = ("simulation", "rollout")
 ) -> dict[Begin, Gap]:
-    """Drift of training clips against that of the roll-out which is shown in the end, at the same frames.
+    """Drift of training clips against that of the final roll-out, at the same frames.
 
     Clips that begin at the simulation (the paper's code) never drift further than their few frames allow. Clips that begin at
-    the roll-out start where it leads: their gap is zero.
+    the roll-out start from its states: their gap is zero.
 
     Args:
-        rollout: its kept states are left as they are.
+        rollout: the roll-out; its kept states are left as they are.
         windows: (first frame, number of frames) of each clip.
         begins: where the clips start from; each gets a gap.
 
@@ -56,7 +56,7 @@ def gaps(
 
 
 def _distance(instant: RolloutFrame) -> float | None:
-    """Mean distance in metres of one frame; None where no particle is in the air."""
+    """Mean distance in metres of one frame; None without active particles."""
     return float(instant.offset.detach().norm(dim=1).mean()) if len(instant.active) else None
 
 

@@ -2,8 +2,8 @@
 
 Architecture of the paper's supplement, "Implementation Details": one network per physical state, each a backbone of two hidden
 layers of 128 with ReLU and one linear head per quantity. The heads start at zero, so that an untrained field changes nothing,
-and every output is bounded by construction (bound x tanh), so that no weights can make a roll-out explode. What the paper's
-ablation "Per-Particle Appearance and Rotation" takes away can be left out (FieldConfig).
+and every output is bounded by construction (bound x tanh), so that no weights can make a roll-out explode. FieldConfig can
+leave out the parts that the paper's ablation "Per-Particle Appearance and Rotation" takes away.
 """
 
 from __future__ import annotations
@@ -46,19 +46,20 @@ class DeltaBounds:
 
 @dataclass(frozen=True, kw_only=True)
 class FieldConfig:
-    """What the field may change."""
+    """Quantities that the field may change."""
 
     velocity: bool = True
-    """Whether motion in the air is corrected; off it stays the simulated one, the paper's "w/o PG" (with rotation off too)."""
+    """Whether motion of active particles is corrected; off it stays the simulated one, the paper's "w/o PG" (with
+    rotation off too)."""
     rotation: bool = True
-    """Whether particles in the air turn; off there is no angular velocity to learn and orientations stay the simulated ones."""
+    """Whether active particles turn; off there is no angular velocity to learn and orientations stay the simulated ones."""
     appearance: Literal["per particle", "shared", "fixed"] = "per particle"
     """How the look changes from frame to frame. "per particle": by place, velocity, time and look. "shared": by time alone, one
     change per state and frame for all particles. "fixed": not at all, and the look that all share is not learned either."""
 
 
 class ActiveDelta(NamedTuple):
-    """What the field adds to n particles in the air in one frame."""
+    """Changes that the field makes to n active particles in one frame."""
 
     velocity: Float[Tensor, "n 3"]
     """Metres per frame."""
@@ -79,7 +80,12 @@ class StateNet(nn.Module):
             nn.init.zeros_(head)
 
     def forward(self, own: Float[Tensor, "n k"], shared: Float[Tensor, "1 m"]) -> dict[str, Tensor]:
-        """Heads in -1..1. The inputs are `own` of each particle followed by those that all `shared`, which cost one row."""
+        """Heads in -1..1.
+
+        Args:
+            own: first inputs, of each particle.
+            shared: the other inputs, the same for all particles; they cost one row.
+        """
         k = own.shape[1]
         constant = linear(shared, self.first.weight[:, k:], self.first.bias)
         hidden = torch.relu(self.second(torch.relu(linear(own, self.first.weight[:, :k]) + constant)))
@@ -90,7 +96,7 @@ class StateNet(nn.Module):
 
 
 class DynamicsField(nn.Module):
-    """Separate networks for particles in the air and particles that have landed."""
+    """Separate networks for active and for collided particles."""
 
     box: Tensor
     speed: Tensor
@@ -134,7 +140,7 @@ class DynamicsField(nn.Module):
         return not any(bool(parameter.any()) for head in self.heads() for parameter in head.parameters())
 
     def heads(self) -> list[nn.Module]:
-        """The last layers of all networks: what is learned is zero where they are."""
+        """The last layers of all networks; if they are zero, so is all that is learned."""
         nets = [self.active_net, self.collided_net, *self.shared_nets.values()]
         return [head for net in nets for head in net.heads.values()]  # type: ignore[union-attr, operator]
 
@@ -145,7 +151,7 @@ class DynamicsField(nn.Module):
         frame: int,
         look: ParticleLook,  # of the previous frame
     ) -> ActiveDelta:
-        """Corrections for particles in the air."""
+        """Corrections of active particles."""
         own = torch.cat([self._place(position), _appearance(look), fourier((velocity / self.speed).clamp(-1, 1))], dim=1)
         out = self.active_net(own, self._time(frame))
         still = torch.zeros_like(position)
@@ -154,7 +160,7 @@ class DynamicsField(nn.Module):
         return ActiveDelta(velocity, rotation, self._change("active", out, frame, position))
 
     def collided(self, position: Float[Tensor, "n 3"], frame: int, look: ParticleLook) -> Change:
-        """Changes for particles at rest; their motion is fixed, their velocity enters as zero."""
+        """Changes of collided particles; their motion is fixed, their velocity enters as zero."""
         if self.config.appearance != "per particle":
             return self._change("collided", {}, frame, position)
         own = torch.cat([self._place(position), _appearance(look)], dim=1)
@@ -179,7 +185,7 @@ class DynamicsField(nn.Module):
 
 
 def within(box: Float[Tensor, "2 3"], position: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Positions as -1..1 between the corners of a box; what lies outside counts as on its wall."""
+    """Positions as -1..1 between the corners of a box; positions outside count as on its wall."""
     low, high = box
     return (2 * (position - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
 

@@ -1,4 +1,4 @@
-"""Appearance that changes: what is added to the initial look of a particle, and the one shift that all particles share.
+"""Changes of appearance: of single particles against their initial look, and the one shift that all particles share.
 
 Opacity changes linearly within 0..1, scale as a factor (its logarithm adds up) within 1/8..8 of the initial one, colour
 linearly within 0..1. A change of zero leaves every bit of the initial look as it is.
@@ -21,7 +21,7 @@ OPACITY_UNIT, COLOUR_UNIT = 3.0, 2.0  # one number moves a look as far as anothe
 
 
 class Change(NamedTuple):
-    """What is added to the appearance of n particles."""
+    """Change of the appearance of n particles."""
 
     opacity: Float[Tensor, " n"]
     log_scale: Float[Tensor, "n 3"]
@@ -51,13 +51,13 @@ def accumulate(look: ParticleLook, change: Change, delta: Change) -> Change:
 
 
 class LearnedLook(nn.Module):
-    """One shift of the look for all particles in the air and one for all that have landed: 2 x (opacity 1, scale 3, colour 3).
+    """One shift of the look for all active particles and one for all collided ones: 2 x (opacity 1, scale 3, colour 3).
 
     The paper says that the initial appearance itself is optimized; a shift that all share moves it coherently and with few
-    numbers, while the field adds what differs by place and time. Zero, its start, is the initial look bit for bit.
+    numbers, while the field adds the differences by place and time. Zero, its start, is the initial look bit for bit.
 
     Size changes at constant matter: a flake twice as wide has a quarter of the odds of being opaque. Otherwise the two hide
-    each other, since what is too faint gains as much light by growing as by thickening, and descent would grow it.
+    each other: a flake that is too faint gains as much light by growing as by thickening, and descent would grow it.
     """
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ def _shifted(look: ParticleLook, raw: Float[Tensor, "7"]) -> ParticleLook:
 
 
 def clamp(x: Tensor, low: Tensor | float, high: Tensor | float) -> Tensor:
-    """Clamp whose gradient vanishes only for a descent that would lead further out: what has saturated can come back."""
+    """Clamp whose gradient vanishes only for a descent that would lead further out: saturated values can come back."""
     if not torch.is_grad_enabled():
         return torch.clamp(x, low, high)  # type: ignore[arg-type]
     return _Clamp.apply(x, low, high)  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""What keeps the learned motion near the simulated one and the appearance calm; paper, eq. physics_guidance and app_reg.
+"""Terms that keep the learned motion near the simulated one and the appearance calm; paper, eq. physics_guidance and app_reg.
 
 Every term is an L2 norm per Gaussian (not its square), averaged over the Gaussians and the frames of the clip. The norms are
 sqrt(x^2 + eps^2) - eps with eps = 1e-6: the same for all that matters, zero at zero, and with a finite gradient there.
@@ -38,17 +38,17 @@ class RegularizationWeights:
     rot: float = 0.1
     """Angle to the initial orientation, per radian."""
     active_opacity: float = 1.0
-    """Change of opacity per frame, in the air."""
+    """Change of opacity per frame, of active particles."""
     active_scale: float = 1.0
-    """Change of the logarithm of the scales per frame, in the air."""
+    """Change of the logarithm of the scales per frame, of active particles."""
     active_rgb: float = 35.0
-    """Change of colour per frame, in the air."""
+    """Change of colour per frame, of active particles."""
     collided_opacity: float = 35.0
-    """Change of opacity per frame, after landing."""
+    """Change of opacity per frame, of collided particles."""
     collided_scale: float = 35.0
-    """Change of the logarithm of the scales per frame, after landing."""
+    """Change of the logarithm of the scales per frame, of collided particles."""
     collided_rgb: float = 35.0
-    """Change of colour per frame, after landing."""
+    """Change of colour per frame, of collided particles."""
     look: float = 0.001
     """Shift of the look that all particles share; not in the paper, which regularizes changes from frame to frame only."""
     without: tuple[str, ...] = ()
@@ -58,7 +58,7 @@ class RegularizationWeights:
     times: float = 1.0
     """Factor on all terms; the paper's study of sensitivity tries 0.1 and 10, on one term at a time."""
     form: Form = "norms"
-    """What is weighted: norms per particle, as the paper writes them, or squares, as its code has them (units squared; for
+    """Form of the terms: norms per particle, as the paper writes them, or squares, as its code has them (units squared; for
     orientations the squared difference of the quaternions)."""
 
     def __post_init__(self) -> None:

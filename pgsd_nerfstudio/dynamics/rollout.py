@@ -1,9 +1,9 @@
 """The roll-out: from simulated motion, initial look and learned field to the Gaussians of any frame.
 
 Training windows start from states that the roll-out really reaches. (The paper's code restarts every training clip from
-simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) What is in the air
-there is rolled from its birth with the present weights, since motion that is held by where it was some steps ago swings about
-where it should be. What lies has lain for longer and only changes its look: `refresh` rolls through everything once in a while
+simulated positions, so that it never sees the drift it later shows; `begin="simulation"` does the same.) Active particles are
+rolled out from their birth with the present weights: states of some steps ago would make the learned motion swing about its
+goal. Collided particles have a longer past and only change their look: `refresh` rolls out the whole sequence once in a while
 and keeps a state every `stride` frames.
 """
 
@@ -32,7 +32,7 @@ Motion = Literal["particle", "field"]
 
 
 class Rollout(GaussianSequence):
-    """Particles over time, at random access and in windows with gradient. Everything is in metres."""
+    """Particles that a field moves by recurrence, from frame to frame."""
 
     def __init__(
         self,
@@ -45,11 +45,17 @@ class Rollout(GaussianSequence):
         exposure: float = 0.0,
         motion: Motion = "particle",
     ) -> None:
-        """`stride` frames lie between kept states; all parts must be on one device.
+        """Set up; nothing is rolled out yet.
 
-        With an `exposure` in seconds the Gaussians in the air carry how far the simulation moves them in that time.
-        `motion`: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or
-        that of the place where it is ("field", see VelocityField); both lead to the simulated contact.
+        Args:
+            history: the simulated motion.
+            look: initial look of all particles.
+            field: the learned corrections.
+            learned_look: the shift of the look that all particles share; None means none.
+            stride: frames from one kept state to the next.
+            exposure: seconds that the shutter is open. Active Gaussians carry how far the simulation moves them in that time.
+            motion: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or
+                that of the place where it is ("field", see VelocityField); both lead to the simulated contact.
 
         Raises:
             ValueError: the stride is below one frame, or there is no such motion.
@@ -66,14 +72,17 @@ class Rollout(GaussianSequence):
 
     @property
     def stale(self) -> bool:
-        """Whether weights have changed since `refresh`: then frames come from states that older weights reached."""
+        """Whether weights have changed since `refresh`; frames then come from states that older weights reached."""
         return self._stamp != self._weights()
 
     @torch.no_grad()
     def refresh(self, progress: Progress | None = None) -> None:
         """Roll through the whole sequence with the present weights and keep a state every `stride` frames.
 
-        Costs nothing before the field has learned anything. `progress` is told (frames done, of how many).
+        This costs nothing before the field has learned anything.
+
+        Args:
+            progress: is told (frames done, of how many).
         """
         weights, keyframes = self._weights(), {}
         if not self.field.still():
@@ -88,8 +97,11 @@ class Rollout(GaussianSequence):
 
     @torch.no_grad()
     def restore(self, refreshed: Mapping[str, Tensor]) -> None:
-        """The kept states as an interrupted training had them: made with the weights of its last `refresh`, while those that
-        have been learned since stay in use."""
+        """Make the kept states as an interrupted training had them; the weights in use stay as they are.
+
+        Args:
+            refreshed: weights of the training's last `refresh`, as the attribute `refreshed` held them.
+        """
         learned = self._copied()
         self._load(refreshed)
         self.refresh()
@@ -109,7 +121,10 @@ class Rollout(GaussianSequence):
 
     @torch.no_grad()
     def afresh(self, frames: Collection[int]) -> Iterator[RolloutFrame]:
-        """These frames in ascending order, rolled from the first of all with the present weights; kept states stay as they are.
+        """Some frames in ascending order, rolled out from frame 0 with the present weights; kept states stay as they are.
+
+        Args:
+            frames: numbers of the frames.
 
         Raises:
             IndexError: there is no such frame.
@@ -180,32 +195,32 @@ class Rollout(GaussianSequence):
         return state
 
     def _under_way(self, frame: int, visible: Bool[Tensor, " p"] | None) -> RolloutState:
-        """The state from which a clip starts: what flies as the present weights have moved it since its birth, what lies as the
-        last `refresh` saw it."""
+        """The state from which a clip starts: active particles as the present weights have moved them since their birth,
+        collided ones as the last `refresh` saw them."""
         if self.field.still():
             return simulated(self.history, frame, visible)
-        flying = self.history.active(frame)
+        active = self.history.active(frame)
         if visible is not None:
-            flying = flying[visible[flying]]
-        aloft = torch.zeros(len(self.history), dtype=torch.bool, device=flying.device)
-        aloft[flying] = True
+            active = active[visible[active]]
+        is_active = torch.zeros(len(self.history), dtype=torch.bool, device=active.device)
+        is_active[active] = True
         look = self._present_look()
-        lying = self._reach(frame, ~aloft if visible is None else visible & ~aloft, look)
-        if len(flying) == 0:
-            return lying
-        few, look = self.history.select(flying), look.select(flying)
+        kept = self._reach(frame, ~is_active if visible is None else visible & ~is_active, look)
+        if len(active) == 0:
+            return kept
+        few, look = self.history.select(active), look.select(active)
         state = simulated(few, int(few.births.min()))
         while state.frame < frame:
             state, _ = advance(state, few, look, self.field, None, self._flow)
-        return replace(state, active=flying, collided=lying.collided, collided_change=lying.collided_change)
+        return replace(state, active=active, collided=kept.collided, collided_change=kept.collided_change)
 
     def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None) -> RolloutFrame:
         history = self.history
         fade = fading(history, state.frame, state.active)
         offset = state.offset * fade[:, None]
-        flying = changed(look.active.select(state.active), state.active_change.times(fade))
-        lying = changed(look.collided_at(history, state.frame, state.collided), state.collided_change)
-        looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(flying), _fields(lying), strict=True)))
+        active = changed(look.active.select(state.active), state.active_change.times(fade))
+        collided = changed(look.collided_at(history, state.frame, state.collided), state.collided_change)
+        looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(active), _fields(collided), strict=True)))
         gaussians = Gaussians(
             torch.cat([history.positions_at(state.frame, state.active) + offset, history.rest_positions[state.collided]]),
             torch.cat([state.quats, history.rest_quats[state.collided]]),
@@ -218,7 +233,7 @@ class Rollout(GaussianSequence):
         return RolloutFrame(state.frame, gaussians, state.active, state.collided, offset, state.quats, simulated_quats, deltas)
 
     def _displacements(self, state: RolloutState) -> Float[Tensor, "k 3"] | None:
-        """Metres while the shutter is open, of all that is rendered; what lies does not move. None where nothing is smeared."""
+        """Metres while the shutter is open, of all that is rendered; collided particles do not move. None without exposure."""
         if self.exposure == 0.0:
             return None
         per_frame = self.history.displacement_at(state.frame, state.active)

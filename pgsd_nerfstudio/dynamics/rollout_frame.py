@@ -1,4 +1,4 @@
-"""One frame of a roll-out: what is handed on to rendering and regularization."""
+"""One frame of a sequence of moving Gaussians, for rendering and regularization, and checks of frames and windows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class RolloutFrame:
-    """One frame of a roll-out: what to render, and what to regularize."""
+    """One frame of a roll-out: Gaussians to render, and quantities to regularize."""
 
     frame: int
     gaussians: Gaussians
@@ -28,7 +28,7 @@ class RolloutFrame:
     """Rendered orientation, wxyz."""
     simulated_quats: Float[Tensor, "n 4"]
     deltas: Deltas | None
-    """What the field added in this frame; None in a roll-out without gradient."""
+    """Changes that the field made in this frame; None in a roll-out without gradient."""
 
 
 def check_frame(frame: int, total: int) -> None:

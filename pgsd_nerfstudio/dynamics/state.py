@@ -1,11 +1,11 @@
-"""What the recurrence carries from frame to frame, and one step of it.
+"""The state that the recurrence carries from frame to frame, and one step of it.
 
 The paper's x(t) = x(t-1) + v_sim(t) + dv is carried as the learned offset alone, d(t) = d(t-1) + dv with x = x_sim + d: the
 same sum, but a field that adds nothing reproduces the simulation bit for bit, however many frames it runs.
 
-A particle that has drifted goes on with the simulated motion of where it is not. With a velocity field V the step gains
-V(x) - V(x_sim): what the simulation does where the particle is rendered instead of where it was simulated. What is its own,
-such as the fall speed of its size, stays with it, and without drift nothing is added.
+A particle that has drifted goes on with the simulated motion of a place where it no longer is. With a velocity field V the step
+gains V(x) - V(x_sim), the difference between the simulated motion at the rendered and at the simulated place. The particle's
+own part, such as the fall speed of its size, stays with it, and without drift nothing is added.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 LANDING_FRAMES = 5
-"""Over so many frames before contact everything learned in flight fades out: the particle lands where and as physics says,
-without a jump. (The paper leaves open what becomes of an offset on landing; dropping it there makes the particle jump.)"""
+"""Frames before contact over which all learned changes of an active particle fade out: it lands where and as the simulation
+says, without a jump. (The paper does not say how an offset ends on landing; dropping it there makes the particle jump.)"""
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,21 @@ class RolloutState:
 
     frame: int
     active: Int[Tensor, " n"]
-    """Ids of the particles in the air, ascending."""
+    """Ids of the active particles, ascending."""
     offset: Float[Tensor, "n 3"]
     """Learned part of the position, metres, before it fades for landing."""
     quats: Float[Tensor, "n 4"]
     active_change: Change
     collided: Int[Tensor, " m"]
-    """Ids of the particles that have landed, ascending."""
+    """Ids of the collided particles, ascending."""
     collided_change: Change
 
     def select(self, visible: Bool[Tensor, " p"] | None) -> RolloutState:
-        """Only the visible ones."""
+        """The state of the visible particles alone.
+
+        Args:
+            visible: mask over all particles; None means all.
+        """
         if visible is None:
             return self
         active, collided = visible[self.active], visible[self.collided]
@@ -60,7 +64,7 @@ class RolloutState:
         )
 
     def detach(self) -> RolloutState:
-        """The same without its past."""
+        """The same state, cut from the graph that led to it."""
         return replace(
             self,
             offset=self.offset.detach(),
@@ -71,7 +75,7 @@ class RolloutState:
 
 
 class Deltas(NamedTuple):
-    """What the field added in one step: to the particles that were in the air before and still are, and to those that lay."""
+    """Changes that the field made in one step: of particles active before and after it, and of particles collided before it."""
 
     active: ActiveDelta
     collided: Change
@@ -103,16 +107,16 @@ def advance(
     """The state one frame later.
 
     Args:
-        state: of the visible particles; `visible` must be the mask it was selected with.
+        state: state of the visible particles; `visible` must be the mask it was selected with.
         history: the simulated motion.
         look: initial look of all particles.
-        field: what is learned.
+        field: the learned corrections.
         visible: particles to follow; None means all.
-        flow: simulated velocities by place; None: every particle keeps to its own, wherever it is.
+        flow: simulated velocities by place; None: every particle keeps to its own trajectory's.
     """
     fresh = simulated(history, state.frame + 1, visible)
     frame, ids = fresh.frame, fresh.active
-    # Ids ascend in both states, so those who stay stand in the same order here and there.
+    # Ids ascend in both states, so particles that stay active are in the same order in both.
     stay, stayed = history.births[ids] < frame, history.ends[state.active] > frame
     ids = ids[stay]
     change, offset, quats = state.active_change, state.offset, state.quats
@@ -125,15 +129,15 @@ def advance(
     if flow is not None:
         elsewhere = flow.at(frame, here) - flow.at(frame, before)
         offset, motion = offset + elsewhere, motion + elsewhere
-    flying = look.active.select(ids)
-    delta = field.active(here, motion, frame, changed(flying, change.times(fade)))
+    initial = look.active.select(ids)
+    delta = field.active(here, motion, frame, changed(initial, change.times(fade)))
 
-    laid = history.ends[fresh.collided] < frame
-    rest = fresh.collided[laid]
+    was_collided = history.ends[fresh.collided] < frame
+    rest = fresh.collided[was_collided]
     collided_change = collided_delta = state.collided_change
     if len(rest):
-        lying = changed(look.collided_at(history, state.frame, rest), state.collided_change)
-        collided_delta = field.collided(history.rest_positions[rest], frame, lying)
+        before_step = changed(look.collided_at(history, state.frame, rest), state.collided_change)
+        collided_delta = field.collided(history.rest_positions[rest], frame, before_step)
         collided_change = accumulate(look.collided_at(history, frame, rest), state.collided_change, collided_delta)
 
     return RolloutState(
@@ -141,9 +145,9 @@ def advance(
         fresh.active,
         _placed(fresh.offset, stay, offset + delta.velocity),
         _placed(fresh.quats, stay, turned(quats, delta.rotation)),
-        _placed_change(fresh.active_change, stay, accumulate(flying, change, delta.change)),
+        _placed_change(fresh.active_change, stay, accumulate(initial, change, delta.change)),
         fresh.collided,
-        _placed_change(fresh.collided_change, laid, collided_change),
+        _placed_change(fresh.collided_change, was_collided, collided_change),
     ), Deltas(delta, collided_delta)
 
 
@@ -154,7 +158,7 @@ def turned(quats: Float[Tensor, "n 4"], rotation: Float[Tensor, "n 3"]) -> Float
 
 
 def fading(history: ParticleHistory, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Factor on what active particles have learned: 1 in free flight, falling to 0 at the frame of contact."""
+    """Factor on the learned changes of active particles: 1 in free flight, falling to 0 at the frame of contact."""
     left = (history.ends[ids] - 1 - frame).to(history.positions) / LANDING_FRAMES
     return torch.where(history.collided[ids], left.clamp(0, 1), 1.0)
 

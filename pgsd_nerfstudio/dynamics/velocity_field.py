@@ -1,7 +1,7 @@
-"""The simulated velocity by place and frame, for particles that are no longer where the simulation had them.
+"""The simulated velocity by place and frame, for particles that have left their simulated places.
 
 The steps of the simulated particles, kept on a coarse grid. A node takes the mean of the particles around it with the weights
-of trilinear interpolation. Reading that back smooths; so the means of what it misses are added a few times (Van Cittert's
+of trilinear interpolation. Reading that back smooths; so the means of the remaining error are added a few times (Van Cittert's
 iteration, stable since the weights are not negative and sum to one), which also takes off most of the error of nodes that have
 particles on one side only. Nodes without particles take the value of the nearest node that has some.
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
 MOST_BYTES = 50e6
-PER_CELL = 4  # particles in the air in a cell, on average: fewer, and the grid keeps their own fall speeds instead of the flow
+PER_CELL = 4  # active particles in a cell, on average: with fewer the grid keeps their own fall speeds instead of the flow
 CORRECTIONS = 3
 
 
@@ -56,7 +56,7 @@ class VelocityField:
     @staticmethod
     @torch.no_grad()
     def of(history: ParticleHistory, cell: float | None = None) -> VelocityField:
-        """The velocities of all particles in the air.
+        """The velocities of all active particles.
 
         Args:
             history: the simulated motion.
@@ -92,7 +92,7 @@ class VelocityField:
         return self.values.nbytes
 
     def at(self, frame: int, position: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Metres that the simulation moves what is at `position` (metres) in frame - 1 until `frame`; with gradient.
+        """Simulated displacement in metres from frame - 1 to `frame` of matter at `position` (metres); with gradient.
 
         Raises:
             IndexError: no step leads to this frame.
@@ -139,7 +139,7 @@ class VelocityField:
 
 
 def _steps(history: ParticleHistory, frame: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Where particles were in the frame before, and how they moved until this one; those in the air in both."""
+    """Positions in the frame before and displacements until this one, of particles active in both."""
     ids = ((history.births < frame) & (frame < history.ends)).nonzero()[:, 0]
     before = history.positions_at(frame - 1, ids)
     return before, history.positions_at(frame, ids) - before
@@ -152,9 +152,9 @@ def _shape(extent: list[float], cell: float) -> tuple[int, int, int]:
 
 def _cell(history: ParticleHistory, extent: list[float], steps: int) -> float:
     """Metres: the smallest cell that memory and the number of particles allow."""
-    flying = max(len(history.positions) / max(history.frames, 1), 1.0)
+    active = max(len(history.positions) / max(history.frames, 1), 1.0)
     volume = math.prod(max(length, 0.01) for length in extent)
-    cell = (PER_CELL * volume / flying) ** (1 / 3)
+    cell = (PER_CELL * volume / active) ** (1 / 3)
     while steps * math.prod(_shape(extent, cell)) * 3 * history.positions.element_size() > MOST_BYTES:
         cell *= 1.05
     return cell

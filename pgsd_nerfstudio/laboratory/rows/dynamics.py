@@ -129,7 +129,7 @@ def _not_finite(roll: Rollout) -> int:
 
 
 def _landing_error(roll: Rollout) -> float:
-    """Largest learned offset in the last frame in the air, of those that land."""
+    """Largest learned offset in the last active frame, of particles that land."""
     worst = 0.0
     for instant in roll.frames():
         landing = roll.history.collided[instant.active] & (roll.history.ends[instant.active] == instant.frame + 1)

@@ -1,5 +1,5 @@
 """Figures of what can be chosen in the room dynamics: what the field may change, how far the gradient runs, where clips begin,
-and whose motion a particle follows that has drifted."""
+and which motion a drifted particle follows."""
 
 from __future__ import annotations
 
@@ -145,14 +145,14 @@ def _changed_by_deformation(history: ParticleHistory) -> int:
 
 
 def _cut_error(history: ParticleHistory) -> float:
-    """Worst relative error of the gradient's number of steps, of a particle that flies through the clip."""
+    """Worst relative error of the gradient's number of steps, of a particle that is active in the whole clip."""
     start = history.frames // 2
-    flying = (history.births < start - 1) & (history.ends > start + CLIP + LANDING_FRAMES)
-    flyer, worst = int(flying.nonzero()[0, 0]), 0.0
+    active = (history.births < start - 1) & (history.ends > start + CLIP + LANDING_FRAMES)
+    chosen, worst = int(active.nonzero()[0, 0]), 0.0
     for cut, steps in ((None, CLIP), (1, 1), (3, (CLIP - 1) % 3 + 1)):
         roll = rollout(history, weights=0.0)
         last = roll.window(start, CLIP, gradient_frames=cut)[-1]
-        height = last.gaussians.means[last.active.tolist().index(flyer), 2]
+        height = last.gaussians.means[last.active.tolist().index(chosen), 2]
         (gradient,) = torch.autograd.grad(height, roll.field.active_net.heads["velocity"].bias)  # type: ignore[arg-type]
         worst = max(worst, abs(float(gradient[2]) / (steps * roll.field.bounds.velocity) - 1))
     return worst
