@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
 PACKAGE = ROOT / "pgsd_nerfstudio"
-BELOW_ALL = ["storage", "refusal"]
+BELOW_ALL = ["version", "storage", "refusal"]
 ROOMS = [
     *("scene", "rendering", "surface", "effects", "physics", "response", "dynamics", "guidance", "weather"),
     *("plugin", "laboratory", "cli"),
@@ -62,7 +62,7 @@ def test_every_pgsd_flag_of_the_readme_is_known(capsys):
 
 
 def test_every_training_flag_of_the_readme_is_a_field_of_the_options():
-    declared = ("plugin/options.py", "effects/knobs.py")
+    declared = ("plugin/options.py", "effects/options.py", "weather/options.py")
     text = "".join((ROOT / "pgsd_nerfstudio" / path).read_text("utf-8") for path in declared)
     fields = {f"--{name.replace('_', '-')}" for name in re.findall(r"^    (\w+): ", text, re.MULTILINE)}
     used = {word for words in commands() if words[0] == "ns-train" for word in words if word.startswith("--")}
