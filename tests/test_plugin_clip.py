@@ -11,10 +11,10 @@ from pgsd_nerfstudio.effects import effect, initial_look
 from pgsd_nerfstudio.physics.clock import Clock, Domain
 from pgsd_nerfstudio.physics.metric import simulate_metric
 from pgsd_nerfstudio.plugin.clip import render_clip, seen_by, surrogate
-from pgsd_nerfstudio.plugin.run_cameras import open_scene
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.response.prepare import answer_of
 from pgsd_nerfstudio.scene.cameras import interpolate
+from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
@@ -26,7 +26,7 @@ BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A scene with 200 flakes above a floor, and a field that has learned something at random."""
     ply = write_scene(tmp_path_factory.mktemp("scene"))
-    scene = open_scene(ply, ply.parent)
+    scene = load_scene(ply, ply.parent)
     rasterizer = choose_rasterizer(scene.gaussians, "cpu")
     prepared = PreparedScene(scene, rasterizer, rasterizer, torch.device("cpu"))
     corners = torch.tensor([[-4.0, -4, 0], [4, -4, 0], [4, 4, 0], [-4, 4, 0]])
