@@ -62,8 +62,7 @@ def test_every_pgsd_flag_of_the_readme_is_known(capsys):
 
 
 def test_every_training_flag_of_the_readme_is_a_field_of_the_options():
-    declared = ("plugin/options.py", "effects/options.py", "weather/options.py")
-    text = "".join((ROOT / "pgsd_nerfstudio" / path).read_text("utf-8") for path in declared)
+    text = "".join(path.read_text("utf-8") for path in PACKAGE.rglob("*options.py"))
     fields = {f"--{name.replace('_', '-')}" for name in re.findall(r"^    (\w+): ", text, re.MULTILINE)}
     used = {word for words in commands() if words[0] == "ns-train" for word in words if word.startswith("--")}
     assert used and used <= fields
