@@ -1,4 +1,4 @@
-"""SEEN: clips of Gaussians through cameras, differentiable.
+"""Rendering: clips of frozen and dynamic Gaussians as cameras see them, differentiable in the dynamic ones.
 
 >>> import torch
 >>> from pgsd_nerfstudio.rendering import choose_rasterizer

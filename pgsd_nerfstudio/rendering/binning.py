@@ -1,4 +1,4 @@
-"""Which splats each tile of the image must look at, nearest first."""
+"""Tile lists: which splats each tile of the image must look at, nearest first."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pgsd_nerfstudio.rendering.rasterizer import TILE
 
 
 class Binned(NamedTuple):
-    """Splats of one camera in order of depth, and the list of them in each tile."""
+    """Splats of one camera in order of depth, and for each tile the list of those that enter it."""
 
     splats: np.ndarray
-    """[m, 16] float32, columns as in projection.py; only those that touch the image, nearest first."""
+    """[m, 16] float32, columns as in projection.py; the splats that touch the image, nearest first."""
     offsets: np.ndarray
-    """[tiles + 1] int32: the entries of tile t are entries[offsets[t]:offsets[t + 1]], tiles row by row."""
+    """[tiles + 1] int32: tile t has entries[offsets[t]:offsets[t + 1]]; tiles are numbered row by row."""
     entries: np.ndarray
     """[k] int32 rows of `splats`, ascending in each tile, so nearest first."""
 
@@ -28,9 +28,9 @@ class Binned(NamedTuple):
 
 @kernel()
 def visible_by_depth(splats):
-    """Rows [m] int32 that touch the image, nearest first, equal depths in the given order.
+    """Rows [m] int32 of the splats that touch the image, nearest first; splats of equal depth keep their order.
 
-    A radix sort on the bits of the depths: positive floats order like their bits.
+    This is a radix sort on the bits of the depths: positive floats order like their bits.
     """
     count = 0
     for i in range(splats.shape[0]):
@@ -63,7 +63,7 @@ def visible_by_depth(splats):
 
 @kernel()
 def _tile_lists(splats, width, height):
-    """Offsets and entries by counting: first how many each tile gets, then one walk in order of depth."""
+    """Offsets and entries by a counting sort: one pass counts the splats of each tile, another fills the lists by depth."""
     across = (width + TILE - 1) // TILE
     down = (height + TILE - 1) // TILE
     offsets = np.zeros(across * down + 1, np.int32)
@@ -85,12 +85,23 @@ def _tile_lists(splats, width, height):
 
 
 def bin_splats(splats: np.ndarray, width: int, height: int) -> Binned:
-    """Tile lists of splats [m, 16] that already are in order of depth."""
+    """Tile lists of splats.
+
+    Args:
+        splats: [m, 16] float32 in order of depth, nearest first, columns as in projection.py.
+        width: of the image in pixels.
+        height: of the image in pixels.
+    """
     return Binned(splats, *_tile_lists(splats, width, height))
 
 
 def keep_entries(binned: Binned, needed: np.ndarray) -> Binned:
-    """Only the `needed` [k] entries, and only the splats that are left in a list."""
+    """The tile lists without the entries that are not needed, and without splats that no list holds any more.
+
+    Args:
+        binned: the lists.
+        needed: [k] bool, one for each entry.
+    """
     before = np.concatenate([[0], np.cumsum(needed)])
     entries = binned.entries[needed]
     used = np.zeros(len(binned.splats), bool)

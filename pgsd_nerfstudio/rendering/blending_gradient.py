@@ -1,23 +1,20 @@
-"""The way back through blending: gradients of the dynamic splats from those of the pixels.
+"""The backward pass of blending: gradients of the dynamic splats from those of the pixels.
 
-Walks front to back again instead of back to front: with v the gradient of a pixel, S = v . C starts as the whole of the pixel
-and loses v . c_i alpha_i T_i at every splat, so that what remains is the part behind it and
+The walk goes front to back again instead of back to front. With v the gradient of a pixel, S = v . C starts as the whole of
+the pixel and loses v . c_i alpha_i T_i at every splat, so that the part behind the splat remains and
 
     dL/dalpha_i = v . c_i T_i - S_behind / (1 - alpha_i).
 
-No transmittance is ever divided out, the walk ends at the last dynamic splat of a tile, and tiles without any are not visited.
+Nothing is ever divided by a transmittance.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pgsd_nerfstudio.rendering.binning import Binned
-from pgsd_nerfstudio.rendering.blending import CHECK_EVERY, any_light, falloff, row_misses
-from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out
+from pgsd_nerfstudio.rendering.compilation import inlined, kernel
 from pgsd_nerfstudio.rendering.projection import (
     BLUE,
-    BOTTOM,
     CUTOFF,
     DEPTH,
     DROP,
@@ -26,41 +23,38 @@ from pgsd_nerfstudio.rendering.projection import (
     PRECISION,
     RED,
     SHEAR,
-    TOP,
     X,
     Y,
 )
 from pgsd_nerfstudio.rendering.rasterizer import TILE
+from pgsd_nerfstudio.rendering.tile import LIGHT, F, clear, ellipse, falloff, light_left, row_misses, row_of, rows_of
 
-F = np.float32
+# Places in the rows of a tile in the backward pass: light as in blending, v . C of the part behind, gradients of the pixel.
+BEHIND, TO_R, TO_G, TO_B, TO_Z = 16, 32, 48, 64, 80
+GRADIENT_ROW = 96
 
-# Places in the rows of a tile on the way back: light as in blending, v . C of what is still to come, gradients of the pixel.
-LIGHT, BEHIND, TO_R, TO_G, TO_B, TO_Z = 0, 16, 32, 48, 64, 80
-ROW = 96
-
-# Places in the sums over a splat's pixels, one for each column of the tile: moments of dL/dsigma in u = dx + S dy and in dy,
-# from which all gradients of the shape follow, and the gradients of colour and depth.
+# Places in the sums over a splat's pixels, one sum for each column of the tile: moments of dL/dsigma in u = dx + S dy and in
+# dy, from which all gradients of the shape follow, then the gradients of colour and depth.
 M_1, M_U, M_UU, M_Y, M_YU, M_YY, S_R, S_G, S_B, S_Z = range(0, 160, 16)
 SUMS = 160
 
 
 @kernel()
-def _pass_frozen(splats, i, tile, left, top, max_alpha, min_transmittance):
-    """Take a frozen splat off what is behind; it wants no gradient."""
-    half_precision, shear, half_drop = F(0.5) * splats[i, PRECISION], splats[i, SHEAR], F(0.5) * splats[i, DROP]
+def pass_frozen(splats, i, tile, left, top, max_alpha, min_transmittance):
+    """Subtract a frozen splat, which gets no gradient, from the part behind in a tile [16, 96]."""
+    half_precision, shear, half_drop = ellipse(splats, i)
     opacity, cutoff = splats[i, OPACITY], splats[i, CUTOFF]
     red, green, blue, depth = splats[i, RED], splats[i, GREEN], splats[i, BLUE], splats[i, DEPTH]
-    for y in range(max(int(splats[i, TOP]) - top, 0), min(int(splats[i, BOTTOM]) - top, TILE)):
-        dy = F(top + y) + F(0.5) - splats[i, Y]
-        base = half_drop * dy * dy
-        offset = F(left) + F(0.5) - splats[i, X] + shear * dy
+    first, last = rows_of(splats, i, top)
+    for y in range(first, last):
+        _, base, offset = row_of(splats, i, shear, half_drop, left, top + y)
         if row_misses(offset, half_precision, base, cutoff):
             continue
         row = tile[y]
         for x in range(16):
             across = F(np.int32(x)) + offset
             sigma = half_precision * across * across + base
-            alpha = min(opacity * falloff(min(sigma, F(80))), max_alpha)
+            alpha = min(opacity * falloff(sigma), max_alpha)
             before = row[LIGHT + x]
             after = before * (F(1) - alpha)
             touched = (sigma <= cutoff) & (before > F(0))
@@ -69,12 +63,12 @@ def _pass_frozen(splats, i, tile, left, top, max_alpha, min_transmittance):
             row[BEHIND + x] -= weight * (
                 row[TO_R + x] * red + row[TO_G + x] * green + row[TO_B + x] * blue + row[TO_Z + x] * depth
             )
-            row[LIGHT + x] = (-before if finished else after) if touched else before
+            row[LIGHT + x] = light_left(before, after, touched, finished)
 
 
 @inlined()
 def _take(sums, place):
-    """Sum of the sixteen numbers from `place` on, which are zero afterwards."""
+    """Sum of the sixteen numbers from `place` on; sets them to zero."""
     total = F(0)
     for x in range(16):
         total += sums[place + x]
@@ -84,21 +78,20 @@ def _take(sums, place):
 
 @kernel()
 def pass_dynamic(splats, i, tile, left, top, max_alpha, min_transmittance, sums, gradients):
-    """The same for a dynamic splat, adding to its row of `gradients` [m, 10]; `sums` [160] are zero before and after."""
-    half_precision, shear, half_drop = F(0.5) * splats[i, PRECISION], splats[i, SHEAR], F(0.5) * splats[i, DROP]
+    """Subtract a dynamic splat and add to its row of `gradients` [m, 10]; `sums` [160] are zero before and after."""
+    half_precision, shear, half_drop = ellipse(splats, i)
     opacity, cutoff = splats[i, OPACITY], splats[i, CUTOFF]
     red, green, blue, depth = splats[i, RED], splats[i, GREEN], splats[i, BLUE], splats[i, DEPTH]
-    for y in range(max(int(splats[i, TOP]) - top, 0), min(int(splats[i, BOTTOM]) - top, TILE)):
-        dy = F(top + y) + F(0.5) - splats[i, Y]
-        base = half_drop * dy * dy
-        offset = F(left) + F(0.5) - splats[i, X] + shear * dy
+    first, last = rows_of(splats, i, top)
+    for y in range(first, last):
+        dy, base, offset = row_of(splats, i, shear, half_drop, left, top + y)
         if row_misses(offset, half_precision, base, cutoff):
             continue
         row = tile[y]
         for x in range(16):
             across = F(np.int32(x)) + offset
             sigma = half_precision * across * across + base
-            unclipped = opacity * falloff(min(sigma, F(80)))
+            unclipped = opacity * falloff(sigma)
             alpha = min(unclipped, max_alpha)
             before = row[LIGHT + x]
             passes = F(1) - alpha
@@ -111,7 +104,7 @@ def pass_dynamic(splats, i, tile, left, top, max_alpha, min_transmittance, sums,
             worth = to_r * red + to_g * green + to_b * blue + to_z * depth
             rest = row[BEHIND + x] - weight * worth
             row[BEHIND + x] = rest
-            row[LIGHT + x] = (-before if finished else after) if touched else before
+            row[LIGHT + x] = light_left(before, after, touched, finished)
             to_sigma = alpha * (rest / passes - worth * before) if drawn & (unclipped <= max_alpha) else F(0)
             to_across = to_sigma * across
             sums[M_1 + x] += to_sigma
@@ -138,80 +131,23 @@ def pass_dynamic(splats, i, tile, left, top, max_alpha, min_transmittance, sums,
     gradients[i, DEPTH] += _take(sums, S_Z)
 
 
-@kernel()
-def _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, sums, gradients):
-    """The walk of blending over tile t, up to its last dynamic splat."""
-    frozen_splats, frozen_entries, i, i_end = frozen.splats, frozen.entries, frozen.offsets[t], frozen.offsets[t + 1]
-    splats, entries, j, j_end = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
-    seen = 0
-    while j < j_end:
-        if i < i_end and frozen_splats[frozen_entries[i], DEPTH] <= splats[entries[j], DEPTH]:
-            _pass_frozen(frozen_splats, frozen_entries[i], tile, left, top, max_alpha, min_transmittance)
-            i += 1
-        else:
-            pass_dynamic(splats, entries[j], tile, left, top, max_alpha, min_transmittance, sums, gradients)
-            j += 1
-        seen += 1
-        if seen % CHECK_EVERY == 0 and not any_light(tile):
-            break
+@inlined()
+def _start_row(row, plane, found, to_found, length):
+    for x in range(length):
+        row[BEHIND + x] += to_found[x] * found[x]
+    if plane > 0:
+        for x in range(length):
+            row[BEHIND + 16 * plane + x] = to_found[x]
 
 
 @inlined()
 def start_tile(tile, columns, rows, left, top, image, to_image):
-    """A tile [16, 96] before the first splat: all light, everything still to come."""
-    for y in range(TILE):
-        row = tile[y]
-        for x in range(ROW):
-            row[x] = F(0)
-        for x in range(16):
-            row[LIGHT + x] = F(1) if (y < rows) & (x < columns) else F(-1)
+    """Set a tile [16, 96] to its state before the first splat: full light, and the whole picture behind."""
+    clear(tile, GRADIENT_ROW, columns, rows)
     for plane in range(5):
         for y in range(rows):
-            row, found, to_found = tile[y], image[plane, top + y, left:], to_image[plane, top + y, left:]
-            place = TO_R + 16 * (plane - 1)
+            found, to_found = image[plane, top + y, left:], to_image[plane, top + y, left:]
             if columns == TILE:  # a loop of constant length, as everywhere
-                for x in range(16):
-                    row[BEHIND + x] += to_found[x] * found[x]
-                if plane > 0:
-                    for x in range(16):
-                        row[place + x] = to_found[x]
+                _start_row(tile[y], plane, found, to_found, 16)
             else:
-                for x in range(columns):
-                    row[BEHIND + x] += to_found[x] * found[x]
-                    if plane > 0:
-                        row[place + x] = to_found[x]
-
-
-def blend_backward(
-    frozen: Binned,
-    dynamic: Binned,
-    width: int,
-    height: int,
-    max_alpha: np.float32,
-    min_transmittance: np.float32,
-    image: np.ndarray,  # [5, h, w] float32: the result of blend_merged
-    to_image: np.ndarray,  # [5, h, w] float32: its gradient
-    gradients: np.ndarray,  # [workers, m, 10] float32, added to
-) -> None:
-    """Add the gradients of the dynamic splats to `gradients`.
-
-    Each worker has its own sums: no two write to one place, and the order of summation never changes.
-    """
-    count = len(gradients)
-    scratch = aligned(count, TILE, ROW), aligned(count, SUMS)
-    numbers = width, height, max_alpha, min_transmittance
-    share_out(_blend_backward, count, *scratch, frozen, dynamic, *numbers, image, to_image, gradients)
-
-
-@kernel()
-def _blend_backward(
-    worker, workers, tiles, sums, frozen, dynamic, width, height, max_alpha, min_transmittance, image, to_image, gradients
-):
-    tile, own_sums, own = tiles[worker], sums[worker], gradients[worker]
-    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    for t in range(worker, across * down, workers):
-        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
-            continue
-        left, top = (t % across) * TILE, (t // across) * TILE
-        start_tile(tile, min(TILE, width - left), min(TILE, height - top), left, top, image, to_image)
-        _walk_tile(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, own_sums, own)
+                _start_row(tile[y], plane, found, to_found, columns)

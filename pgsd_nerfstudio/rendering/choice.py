@@ -1,4 +1,4 @@
-"""Which rasterizer for which device."""
+"""The choice of a rasterizer by device."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 def choose_rasterizer(frozen: Gaussians, device: torch.device | str, layers: int | None = None) -> Rasterizer:
-    """The rasterizer for a device: numba on the CPU, gsplat with CUDA; the frozen Gaussians are moved there.
+    """The rasterizer for a device: numba on the CPU, gsplat with CUDA.
+
+    Args:
+        frozen: the frozen scene; it is moved to the device.
+        device: cpu or cuda.
+        layers: number of layers of `CpuRasterizer`; None blends the frozen scene exactly.
 
     Raises:
-        ValueError: there is no rasterizer for the device, or `layers` (see CpuRasterizer) are asked of another than the CPU's.
+        ValueError: there is no rasterizer for the device, or `layers` is given for another device than the CPU.
     """
     kind = torch.device(device).type
     if layers is not None and kind != "cpu":

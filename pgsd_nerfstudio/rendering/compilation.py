@@ -1,10 +1,10 @@
-"""How the numba kernels of this room are compiled, and run on several threads.
+"""Compilation of this room's numba kernels, and their work on several threads.
 
-Compiled kernels are kept on disk and made anew when any file of this room changes: they are made of each other and of constants
-from several files, where numba by itself looks only at the file that a kernel stands in.
+Compiled kernels are kept on disk and compiled anew when any file of this room changes: kernels call each other and read
+constants from several files, whereas numba by itself checks only the file of the kernel.
 
-Threads are Python's own, which run at once since kernels need no interpreter. numba's `parallel=True` would do the same for
-twice the compilation, and its OpenMP threads spin while they wait for those of torch.
+The threads are Python's own; they run in parallel since kernels release the interpreter's lock. numba's `parallel=True` would
+do the same for twice the compilation, and its OpenMP threads spin while they wait for those of torch.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
 
 def room_stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
-    """Name, time of the last change and size of every source file of a folder."""
+    """Name, time of the last change and size in bytes of every source file of a folder."""
     return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in sorted(folder.glob("*.py")))
 
 
@@ -34,11 +34,15 @@ _STAMP = room_stamp(Path(__file__).parent)
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of a kernel for one thread."""
+    """Decorator that compiles a function as a kernel for one thread.
+
+    Args:
+        **options: further options of `numba.njit`.
+    """
 
     def decorate(function: Callable[..., Any]) -> Any:
         made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_MATH, **options)(function)
-        # What numba compares with the stamp in its index of compiled functions; it offers no public way to say more.
+        # numba compares this with the stamp in its index of compiled functions; there is no public way to set it.
         made._cache._cache_file._source_stamp = _STAMP
         return made
 
@@ -46,16 +50,22 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 inlined = partial(numba.njit, inline="always")
-"""Decorator of a piece of a kernel."""
+"""Decorator of a function whose source numba puts into the kernels that call it, where their options hold for it."""
 
 
 def workers() -> int:
-    """How many threads kernels run on: as many as torch uses."""
+    """Number of threads that kernels run on: as many as torch uses."""
     return torch.get_num_threads()
 
 
 def share_out(work: Callable[..., None], count: int, *arguments: object) -> None:
-    """Run `work(worker, count, *arguments)` for the workers 0 .. count - 1, each on a thread of its own."""
+    """Call `work(worker, count, *arguments)` for each worker 0 .. count - 1 on a thread of its own, and wait for all.
+
+    Args:
+        work: a kernel; it does the share of one worker.
+        count: number of workers.
+        *arguments: passed on to every worker.
+    """
     others = [_pool().submit(work, worker, count, *arguments) for worker in range(1, count)]
     work(0, count, *arguments)
     for other in others:
@@ -68,7 +78,11 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def aligned(*shape: int) -> Float[np.ndarray, "..."]:
-    """Zeros in float32 that begin with a cache line, so that sixteen of them never lie across two."""
+    """Zeros in float32 that begin with a cache line, so that an aligned group of sixteen never spans two lines.
+
+    Args:
+        *shape: of the array; the last side is a multiple of 16 if each row is to be aligned.
+    """
     size = int(np.prod(shape))
     buffer = np.zeros(size + 16, np.float32)
     start = -(buffer.ctypes.data // 4) % 16

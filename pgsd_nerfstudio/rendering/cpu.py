@@ -1,4 +1,4 @@
-"""The rasterizer for machines without a GPU: numba on all cores, forward and backward."""
+"""The rasterizer for the CPU: numba kernels on all cores, forward and backward."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pgsd_nerfstudio.rendering.binning import Binned
-from pgsd_nerfstudio.rendering.blending import blend_merged
-from pgsd_nerfstudio.rendering.blending_gradient import blend_backward
 from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
-from pgsd_nerfstudio.rendering.layers_walk import blend_layered, blend_layered_backward
 from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
+from pgsd_nerfstudio.rendering.walk import blend_backward, blend_merged
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 class CpuRasterizer:
-    """Renders a frozen scene, and dynamic Gaussians among it, on the CPU.
+    """Renders a frozen scene with dynamic Gaussians in it on the CPU.
 
-    The first picture from a camera prepares the frozen scene for it; that is kept, within `cache_bytes`, so later pictures from
-    the same camera cost little more than what moves. May be called from several Python threads.
+    The first picture from a camera prepares a view of the frozen scene. The view is kept, so later pictures from the same
+    camera cost little more than their dynamic Gaussians. Several Python threads may call a rasterizer.
     """
 
     def __init__(
@@ -40,10 +38,17 @@ class CpuRasterizer:
         cache_bytes: int = 1 << 30,
         layers: int | None = None,
     ) -> None:
-        """`layers`: press the frozen part of each tile into so many layers (see layers.py); None: exact.
+        """Check the frozen scene; views are prepared when cameras are first rendered.
+
+        Args:
+            frozen: the frozen scene, on the CPU.
+            config: conventions of the picture; gsplat 1.4.0's by default.
+            cache_bytes: memory for prepared views; beyond it the least recently used are dropped.
+            layers: number of layers that the frozen splats of each tile are pressed into (see layers.py); None blends them
+                exactly.
 
         Raises:
-            ValueError: the Gaussians are not on the CPU or not finite, or there is less than one layer.
+            ValueError: the Gaussians are not on the CPU or not finite, or `layers` is less than one.
         """
         if frozen.device.type != "cpu":
             raise ValueError(f"CpuRasterizer expects Gaussians on the CPU, found them on {frozen.device}; call .to('cpu')")
@@ -87,19 +92,21 @@ class CpuRasterizer:
 
 
 class _Walk(NamedTuple):
-    """What the way back needs of a frame."""
+    """What the backward pass needs from the forward pass of a frame."""
 
     view: View
     part: Binned | Layers
     dynamic: Binned
     ids: np.ndarray
-    """[m] int32: the Gaussian that each splat of `dynamic` is."""
+    """[m] int32: the index of the Gaussian of each splat in `dynamic`."""
     limits: tuple[np.float32, np.float32]
+    """max_alpha and min_transmittance."""
     image: np.ndarray
+    """[5, h, w] float32 as in blending.py."""
 
 
 class _RenderMerged(torch.autograd.Function):
-    """One frame, [5, h, w] as in blending.py."""
+    """One frame [5, h, w] as in blending.py, with gradients for the tensors of its dynamic Gaussians."""
 
     @staticmethod
     def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, *tensors: Tensor) -> Tensor:
@@ -108,10 +115,7 @@ class _RenderMerged(torch.autograd.Function):
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
         scene = dynamic, width, height, *limits, image
-        if isinstance(frozen.part, Layers):
-            blend_layered(frozen.part, *scene)
-        else:
-            blend_merged(frozen.part, *scene)
+        blend_merged(frozen.part, *scene)
         ctx.save_for_backward(*tensors)
         ctx.walk = _Walk(view, frozen.part, dynamic, ids, limits, image)
         return torch.from_numpy(image)
@@ -125,15 +129,12 @@ class _RenderMerged(torch.autograd.Function):
 
 
 def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:
-    """Gradients of the tensors of the dynamic Gaussians, in their order."""
+    """Gradients of the tensors of the dynamic Gaussians, in the order of these tensors."""
     view, part, dynamic, ids, limits, image = walk
     lens = view.lens
     to_splats = np.zeros((workers(), len(ids), GRADIENT_COLUMNS), np.float32)
     scene = dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats
-    if isinstance(part, Layers):
-        blend_layered_backward(part, *scene)
-    else:
-        blend_backward(part, *scene)
+    blend_backward(part, *scene)
     means, quats, scales = (float_array(tensor) for tensor in (gaussians.means, gaussians.quats, gaussians.scales))
     motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
     found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]

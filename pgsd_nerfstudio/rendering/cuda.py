@@ -1,8 +1,8 @@
 """The rasterizer for CUDA: gsplat's kernels, with the frozen scene projected and sorted once for each camera.
 
-gsplat's own `rasterization` would project, sort and differentiate a frozen scene of millions of Gaussians in every frame, for
-the sake of a few thousand that move. Here its parts are called one by one: per frame only what moves is projected and sorted,
-and merged with the frozen scene's list. The picture is the same.
+gsplat's own `rasterization` would project, sort and differentiate a frozen scene of millions of Gaussians in every frame for
+the sake of a few thousand dynamic ones. This rasterizer calls gsplat's parts one by one: in each frame it projects and sorts
+only the dynamic Gaussians and merges them with the frozen scene's list. The picture is the same.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 class Splats(NamedTuple):
-    """Gaussians that one camera sees, as gsplat's blending takes them."""
+    """Gaussians that one camera sees, in the form that gsplat blends."""
 
     centers: Float[Tensor, "m 2"]
     """Pixels."""
@@ -40,7 +40,7 @@ class Splats(NamedTuple):
 
 
 class Sorted(NamedTuple):
-    """Splats, and the tiles they enter."""
+    """Splats, and the tiles that they enter."""
 
     splats: Splats
     isects: Isects
@@ -51,15 +51,24 @@ class Sorted(NamedTuple):
 
 
 class GsplatRasterizer:
-    """Renders a frozen scene, and dynamic Gaussians among it, with gsplat.
+    """Renders a frozen scene with dynamic Gaussians in it with gsplat.
 
-    The first picture from a camera prepares the frozen scene for it; that is kept on the device, within `cache_bytes`.
+    The first picture from a camera prepares a view of the frozen scene, which is kept on the device.
     """
 
     def __init__(self, frozen: Gaussians, *, config: RasterConfig | None = None, cache_bytes: int = 1 << 30) -> None:
-        """Raises ValueError: the Gaussians are not on CUDA or not finite, or gsplat cannot be configured so."""
+        """Check the frozen scene; views are prepared when cameras are first rendered.
+
+        Args:
+            frozen: the frozen scene, on CUDA.
+            config: conventions of the picture; those of the installed gsplat by default.
+            cache_bytes: memory for prepared views; beyond it the least recently used are dropped.
+
+        Raises:
+            ValueError: the Gaussians are not on CUDA or not finite, or gsplat cannot be configured as `config` says.
+        """
         self._check_device(frozen)
-        # What gsplat compiles in cannot be asked of it.
+        # gsplat has no function that tells which numbers it was compiled with.
         compiled_in = RasterConfig.of_gsplat(gsplat.__version__)
         self.config = config or compiled_in
         if self.config != replace(compiled_in, blur=self.config.blur, near=self.config.near, far=self.config.far):
@@ -101,9 +110,9 @@ class GsplatRasterizer:
             raise ValueError(f"GsplatRasterizer expects Gaussians on CUDA, found them on {frozen.device}; call .to('cuda')")
 
     def _frame(self, cameras: Cameras, k: int, moving: Gaussians | None, moment: Moment | None) -> Float[Tensor, "h w 5"]:
-        """Sums along the rays: red, green, blue, weighted depth, accumulation."""
+        """Sums along the rays of frame k: red, green, blue, weighted depth, accumulation."""
         view = Viewpoint.of(cameras, k, self.frozen.means)
-        # The key is made of what the caller holds, mostly on the CPU: the device need not be waited for.
+        # The key is made of the caller's tensors, which are mostly on the CPU, so nothing waits for the device.
         key = b"" if moment is None else moment.key
         scene = self.views.get(
             cameras.viewmats[k], cameras.Ks[k], view.width, view.height, lambda: self._prepare(view, moment), key
@@ -127,10 +136,15 @@ class GsplatRasterizer:
         )
 
     def _sort(self, gaussians: Gaussians, view: Viewpoint, shade: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Sorted:
-        """The Gaussians that touch the image, projected and sorted; `shade`: colours, means and indices to the colours that
-        arrive."""
+        """Project and sort the Gaussians that touch the image.
+
+        Args:
+            gaussians: on the device of the frozen scene.
+            view: the camera.
+            shade: from colours [m, 3], means [m, 3] and indices [m] of Gaussians to the colours that arrive at the camera.
+        """
         radii, *projected = self._project(gaussians, view)
-        seen = torch.nonzero(radii > 0)[:, 0]  # of the others gsplat leaves the memory as it was
+        seen = torch.nonzero(radii > 0)[:, 0]  # for the others gsplat leaves the memory as it was
         centers, depths, conics = (tensor[seen] for tensor in projected)
         gaussians = gaussians.select(seen)
         colors = shade(view_colors(gaussians.colors, gaussians.means, view.viewmat), gaussians.means, seen)
@@ -156,7 +170,7 @@ class GsplatRasterizer:
         return [tensor[0] for tensor in found]
 
     def _opacities(self, gaussians: Gaussians, view: Viewpoint) -> Float[Tensor, " m"]:
-        """Averaged over the exposure; all are in front of the camera."""
+        """Opacities averaged over the exposure, of Gaussians in front of the camera."""
         if gaussians.displacements is None:
             return gaussians.opacities
         turn = view.viewmat[:3, :3]
@@ -167,7 +181,7 @@ class GsplatRasterizer:
 
 
 def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:
-    """Of symmetric matrices, row by row, as gsplat takes covariances."""
+    """The upper triangle of symmetric matrices, row by row, as gsplat takes covariances."""
     return matrices.flatten(1)[:, [0, 1, 2, 4, 5, 8]]
 
 

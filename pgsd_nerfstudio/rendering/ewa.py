@@ -1,6 +1,6 @@
-"""Shapes of Gaussians in space and the linearised perspective that carries them to the image plane, in plain torch.
+"""Covariances of Gaussians in space and the linearised perspective that projects them to the image plane, in plain torch.
 
-Zwicker et al., "EWA Splatting" (2002). Differentiable, for any dtype and device.
+The formulas are those of Zwicker et al., "EWA Splatting" (2002). All functions are differentiable, for any dtype and device.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotations of wxyz quaternions of any length; none at all for the quaternion zero, where roma's are zero matrices."""
-    # The square is bounded and not the root: at zero the root has no gradient.
+    """Rotations of wxyz quaternions of any length; the quaternion zero gives the identity, where roma gives zero matrices."""
+    # The bound is on the square and not on the root, since the root has no gradient at zero.
     w, x, y, z = (quats / quats.square().sum(dim=-1, keepdim=True).clamp_min(1e-24).sqrt()).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
@@ -25,7 +25,7 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
-    """Second moments in space, without motion."""
+    """Covariances in space without motion, in scene units squared."""
     axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :]
     return axes @ axes.mT
 
@@ -37,7 +37,7 @@ def perspective_jacobians(
     height: int,
     frustum_margin: float,
 ) -> Float[Tensor, "n 2 3"]:
-    """How pixels change with a point in camera axes; taken no further outside the image than `RasterConfig.frustum_margin`."""
+    """Derivatives of pixels by points in camera axes, taken no further outside the image than `RasterConfig.frustum_margin`."""
     x, y, z = points.unbind(-1)
     focal, center, extent = K.diagonal()[:2], K[:2, 2], torch.tensor([width, height]).to(K)
     slack = frustum_margin * 0.5 * extent / focal

@@ -1,8 +1,8 @@
-"""What can be prepared of a frozen scene for one camera, kept as long as there is room.
+"""Views of a frozen scene: what can be prepared for one camera, kept as long as there is room.
 
-Projecting, sorting and binning a large scene costs more than blending a small image of it, and the scene never changes: it is
-done once for each camera. The saving is exact, no picture differs by a bit. Pressed into layers on top (layers.py) the scene
-costs hardly more than what moves in it, at a small error.
+Projecting, sorting and binning a large scene costs more than blending a small image of it. The scene never changes, so this is
+done once for each camera. The saving is exact: no picture differs by a bit. If the scene is also pressed into layers
+(layers.py), a frame costs hardly more than its dynamic Gaussians, at a small error.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 class View(NamedTuple):
-    """One camera as the kernels see it."""
+    """One camera as the kernels need it."""
 
     viewmat: np.ndarray
-    """[4, 4] float64."""
+    """[4, 4] float64, world to camera."""
     lens: Lens
 
 
 class FrozenView(NamedTuple):
-    """A frozen scene seen by one camera."""
+    """A frozen scene prepared for one camera."""
 
     part: Binned | Layers
-    """What dynamic splats are merged with."""
+    """The frozen splats or layers that dynamic splats are merged with."""
     image: np.ndarray
     """[5, h, w] float32 as in blending.py: the frozen scene alone, without background."""
 
@@ -46,22 +46,31 @@ class FrozenView(NamedTuple):
 
 
 def float_array(tensor: torch.Tensor) -> np.ndarray:
-    """A contiguous float32 array for the kernels; shares memory where it can."""
+    """A contiguous float32 array for the kernels; it shares memory with the tensor if it can."""
     return np.ascontiguousarray(tensor.detach().to(torch.float32).numpy())
 
 
 def motions_array(gaussians: Gaussians) -> np.ndarray:
-    """Displacements [n, 3] for the kernels, [0, 3] where nothing moves."""
+    """Displacements [n, 3] for the kernels, [0, 3] if there are none."""
     moved = gaussians.displacements
     return np.zeros((0, 3), np.float32) if moved is None else float_array(moved)
 
 
 Shade = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
-"""From colours [m, 3], means [m, 3] and indices [m] of Gaussians to the colours that arrive."""
+"""From colours [m, 3], means [m, 3] and indices [m] of Gaussians to the colours that arrive at the camera."""
 
 
 def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple[Binned, np.ndarray]:
-    """The Gaussians on the image plane of a camera, and which of them each splat is (int32)."""
+    """Project, sort and bin Gaussians.
+
+    Args:
+        gaussians: on the CPU.
+        view: the camera.
+        shade: changes the colours on their way to the camera; None leaves them.
+
+    Returns:
+        The splats with their tile lists, and the index [m] int32 of the Gaussian of each splat.
+    """
     splats = np.empty((len(gaussians), COLUMNS), np.float32)
     project(
         float_array(gaussians.means),
@@ -86,7 +95,7 @@ def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple
 
 
 class FrozenViews:
-    """A frozen scene for many cameras; the least recently used are forgotten beyond `cache_bytes`."""
+    """Prepared views of a frozen scene, one for each camera; the least recently used are dropped when memory runs out."""
 
     def __init__(self, gaussians: Gaussians, config: RasterConfig, cache_bytes: int, layers: int | None = None) -> None:
         self._gaussians = gaussians
@@ -96,7 +105,7 @@ class FrozenViews:
 
     @property
     def nbytes(self) -> int:
-        """Memory held now."""
+        """Bytes that the views hold now."""
         return self._cache.nbytes
 
     def __len__(self) -> int:
@@ -108,7 +117,15 @@ class FrozenViews:
     def get(
         self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, moment: Moment | None = None
     ) -> tuple[View, FrozenView]:
-        """The scene for one camera at a moment, made if it is not held."""
+        """The view of one camera at a moment, prepared if it is not kept.
+
+        Args:
+            viewmat: [4, 4], world to camera.
+            K: [3, 3] intrinsics in pixels.
+            width: of the image in pixels.
+            height: of the image in pixels.
+            moment: how the weather changes the frozen scene; None leaves it.
+        """
         intrinsics = K.detach().cpu().double().numpy()
         pose = np.ascontiguousarray(viewmat.detach().cpu().double().numpy())
         view = View(pose, lens(intrinsics, width, height, self._config))

@@ -1,6 +1,6 @@
-"""Gaussians by tile and depth in gsplat's encoding, and two sorted lists of them merged without sorting again.
+"""Lists of Gaussians by tile and depth in gsplat's encoding, and the merge of two sorted lists without sorting again.
 
-An id is tile << 32 | bits of the depth: the bits of positive floats are ordered like the floats.
+An id is tile << 32 | bits of the depth; the bits of positive floats order like the floats.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ class Isects(NamedTuple):
     ids: Int[Tensor, " e"]
     """int64, ascending."""
     rows: Int[Tensor, " e"]
-    """int32: the Gaussian of each (gsplat: flatten_ids)."""
+    """int32: the index of the Gaussian of each id (gsplat: flatten_ids)."""
     offsets: Int[Tensor, "1 tiles_down tiles_across"]
-    """int32: where each tile begins."""
+    """int32: the first id of each tile."""
 
 
 def merge(first: Isects, second: Isects, first_gaussians: int) -> Isects:
-    """What sorting both together would give, the Gaussians of `second` numbered after the `first_gaussians` of `first`.
+    """The list that a stable sort of both together would give: for equal ids, those of `first` come first.
 
-    As in a stable sort, `first` comes first where ids are equal.
+    Args:
+        first: one list.
+        second: another list, whose Gaussians are numbered after those of `first`.
+        first_gaussians: number of Gaussians of `first`.
     """
-    # The place of each is its own index and the number of the other list's that come before it.
+    # The place of an id is its own index plus the number of ids of the other list that come before it.
     to_first = _count_up(first.ids) + torch.searchsorted(second.ids, first.ids)
     to_second = _count_up(second.ids) + torch.searchsorted(first.ids, second.ids, right=True)
     ids = first.ids.new_empty(len(first.ids) + len(second.ids))

@@ -1,10 +1,10 @@
-"""The frozen part of every tile pressed into a few layers, so that a frame costs little more than what moves.
+"""The frozen splats of every tile pressed into a few layers, so that a frame costs little more than its dynamic splats.
 
 A layer is what some consecutive frozen splats of a tile do together to each of its pixels: a premultiplied colour, a weighted
-depth and the light they let through. Composited one after the other the layers are the frozen picture again, whatever their
-number (Porter & Duff, "Compositing digital images", 1984: "over" is associative). What is lost is only the order against
-dynamic splats that fly inside a layer: those are drawn wholly before or wholly behind it. Layers hold equal shares of the
-blended weight of their tile, so they are thin where much is seen.
+depth and the light they let through. The layers composited one after the other are the frozen picture again, whatever their
+number (Porter & Duff, "Compositing digital images", 1984: "over" is associative). Only the order against dynamic splats
+inside a layer is lost: these are drawn wholly in front of it or wholly behind it. Each layer holds an equal share of the
+blended weight of its tile, so layers are thin where much is seen.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from pgsd_nerfstudio.rendering.binning import Binned
-from pgsd_nerfstudio.rendering.blending import LIGHT, ROW, B, G, R, Z, blend_splat, clear_tile
+from pgsd_nerfstudio.rendering.blending import ROW, B, G, R, Z, blend_splat
+from pgsd_nerfstudio.rendering.blending_gradient import BEHIND, TO_B, TO_G, TO_R, TO_Z
 from pgsd_nerfstudio.rendering.compilation import aligned, inlined, kernel, share_out, workers
 from pgsd_nerfstudio.rendering.projection import DEPTH
 from pgsd_nerfstudio.rendering.rasterizer import TILE
-
-F = np.float32
+from pgsd_nerfstudio.rendering.tile import LIGHT, F, clear, pixels_of, tiles_of
 
 
 class Layers(NamedTuple):
@@ -28,12 +28,14 @@ class Layers(NamedTuple):
     offsets: np.ndarray
     """[tiles + 1] int32: the layers of tile t are offsets[t]:offsets[t + 1], nearest first."""
     depths: np.ndarray
-    """[n] float32, scene units: half of the layer's weight lies nearer; dynamic splats from here on are behind it."""
+    """[n] float32, scene units: half of the layer's weight is nearer than this; dynamic splats nearer than this are drawn in
+    front of the layer, others behind it."""
     planes: np.ndarray
-    """[n, 16, 80] uint16, rows as in blending.py: light let through, premultiplied colour, and depth weighted alike; in steps
-    of `steps`. Half the bytes of float32, which is what walking layers costs most; the rounding is far below their error."""
+    """[n, 16, 80] uint16, rows as in blending.py: light let through, premultiplied colour, and depth weighted like the colour,
+    in units of `steps`. They take half the bytes of float32, and reading them is the largest cost of a layer; the rounding is
+    far below the error of layers."""
     steps: np.ndarray
-    """[n, 5] float32: what one step of each plane is worth; of light 2^-15, so that one is exact."""
+    """[n, 5] float32: the unit of each plane; that of light is 2^-15, so that the light 1 is exact."""
 
     @property
     def nbytes(self) -> int:
@@ -42,7 +44,7 @@ class Layers(NamedTuple):
 
 @inlined()
 def _light_left(tile):
-    """Sum over a tile of what is left of the light; of finished pixels too."""
+    """Sum of the light left in the pixels of a tile, finished pixels included."""
     total = F(0)
     for y in range(TILE):
         row = tile[y]
@@ -53,7 +55,7 @@ def _light_left(tile):
 
 @kernel()
 def _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends, depths):
-    """Where the layers of tile t end (entries, exclusive) and their depths; returns how many there are, at most `count`."""
+    """Find where the layers of tile t end (entries, exclusive) and their depths; returns their number, at most `count`."""
     splats, entries, first, last = frozen.splats, frozen.entries, frozen.offsets[t], frozen.offsets[t + 1]
     weights = np.zeros(last - first, np.float32)
     before = _light_left(tile)
@@ -70,7 +72,7 @@ def _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends
         inside += weights[k]
         if behind + inside < total * F(layers + 1) / F(count) and k + 1 < last - first:
             continue
-        # The layer is full: its depth is where half of its weight is reached.
+        # The layer is full; its depth is that of the splat at which half of its weight is reached.
         half, middle = F(0.5) * inside, begin
         while middle < k and half > weights[middle]:
             half -= weights[middle]
@@ -89,26 +91,25 @@ def _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends
 
 @kernel()
 def _split_all(worker, workers, tiles, frozen, width, height, max_alpha, min_transmittance, count, numbers, ends, depths):
-    """Numbers [tiles], ends [tiles, count] and depths [tiles, count] of the layers."""
-    tile, across, down = tiles[worker], (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    for t in range(worker, across * down, workers):
-        left, top = (t % across) * TILE, (t // across) * TILE
-        clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+    """Fill the numbers [tiles], ends [tiles, count] and depths [tiles, count] of the layers."""
+    tile = tiles[worker]
+    for t in range(worker, tiles_of(width, height), workers):
+        left, top, columns, rows = pixels_of(t, width, height)
+        clear(tile, ROW, columns, rows)
         numbers[t] = _split(frozen, t, tile, left, top, max_alpha, min_transmittance, count, ends[t], depths[t])
 
 
 @kernel()
 def _fill(worker, workers, tiles, frozen, width, height, max_alpha, min_transmittance, offsets, ends, planes, steps):
-    """Planes of all layers: what changed in the tile from one end to the next, relative to the light that came in.
+    """Fill the planes of all layers: the change of the tile from one end to the next, relative to the light that came in.
 
-    The differences cancel where little light is left, and just there they count for as little: no dynamic splat adds light.
+    The differences lose digits where little light is left, and there they count as little: no dynamic splat adds light.
     """
     tile, before, layer = tiles[worker, 0], tiles[worker, 1], tiles[worker, 2]
     splats, entries = frozen.splats, frozen.entries
-    across, down = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    for t in range(worker, across * down, workers):
-        left, top = (t % across) * TILE, (t // across) * TILE
-        clear_tile(tile, min(TILE, width - left), min(TILE, height - top))
+    for t in range(worker, tiles_of(width, height), workers):
+        left, top, columns, rows = pixels_of(t, width, height)
+        clear(tile, ROW, columns, rows)
         k = frozen.offsets[t]
         for n in range(offsets[t], offsets[t + 1]):
             for y in range(TILE):
@@ -128,7 +129,7 @@ def _fill(worker, workers, tiles, frozen, width, height, max_alpha, min_transmit
 
 @kernel()
 def _quantise(layer, planes, steps):
-    """A layer [16, 80] as whole numbers of steps [5]."""
+    """Write a layer [16, 80] as whole numbers of its steps [5]."""
     for plane in range(5):
         place, largest = 16 * plane, F(1e-12)
         for y in range(TILE):
@@ -141,7 +142,16 @@ def _quantise(layer, planes, steps):
 
 
 def press(frozen: Binned, width: int, height: int, max_alpha: np.float32, min_transmittance: np.float32, count: int) -> Layers:
-    """At most `count` layers for each tile."""
+    """Press the frozen splats of each tile into layers.
+
+    Args:
+        frozen: tile lists of the frozen splats.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        max_alpha: as in `RasterConfig`.
+        min_transmittance: as in `RasterConfig`.
+        count: number of layers of a tile, at most.
+    """
     tiles, threads = len(frozen.offsets) - 1, workers()
     numbers, ends = np.zeros(tiles, np.int32), np.zeros((tiles, count), np.int32)
     depths = np.zeros((tiles, count), np.float32)
@@ -151,3 +161,43 @@ def press(frozen: Binned, width: int, height: int, max_alpha: np.float32, min_tr
     planes, steps = np.empty((offsets[-1], TILE, ROW), np.uint16), np.empty((offsets[-1], 5), np.float32)
     share_out(_fill, threads, aligned(threads, 3, TILE, ROW), *scene, offsets, ends, planes, steps)
     return Layers(offsets, depths[np.arange(count) < numbers[:, None]], planes, steps)
+
+
+@inlined()
+def _dimmed(before, through):
+    """Light of a pixel behind a layer that lets the share `through` of it through; a finished pixel stays as it is."""
+    return before * through if before > F(0) else before
+
+
+@inlined()
+def blend_layer(planes, steps, k, tile):
+    """Blend layer k into a tile [16, 80] behind what the tile holds."""
+    through, red, green, blue, depth = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3], steps[k, 4]
+    for y in range(TILE):
+        row, own = tile[y], planes[k, y]
+        for x in range(16):
+            before = row[LIGHT + x]
+            light = max(before, F(0))
+            row[R + x] += light * (red * F(own[R + x]))
+            row[G + x] += light * (green * F(own[G + x]))
+            row[B + x] += light * (blue * F(own[B + x]))
+            row[Z + x] += light * (depth * F(own[Z + x]))
+            row[LIGHT + x] = _dimmed(before, through * F(own[LIGHT + x]))
+
+
+@inlined()
+def pass_layer(planes, steps, k, tile):
+    """Subtract layer k from the part behind in a tile [16, 96] of the backward pass."""
+    through, red, green, blue, depth = steps[k, 0], steps[k, 1], steps[k, 2], steps[k, 3], steps[k, 4]
+    for y in range(TILE):
+        row, own = tile[y], planes[k, y]
+        for x in range(16):
+            before = row[LIGHT + x]
+            worth = (
+                row[TO_R + x] * (red * F(own[R + x]))
+                + row[TO_G + x] * (green * F(own[G + x]))
+                + row[TO_B + x] * (blue * F(own[B + x]))
+                + row[TO_Z + x] * (depth * F(own[Z + x]))
+            )
+            row[BEHIND + x] -= max(before, F(0)) * worth
+            row[LIGHT + x] = _dimmed(before, through * F(own[LIGHT + x]))

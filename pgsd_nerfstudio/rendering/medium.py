@@ -1,12 +1,12 @@
-"""What the air takes of the light on its way to the camera, and what it gives instead: fog, dust, falling rain and snow.
+"""Light on its way through the air to the camera: fog, dust, falling rain and snow absorb it and add airlight.
 
 Along a ray, light of colour c from distance d arrives as c T + A (1 - T), T = exp(-optical depth), A the airlight (Koschmieder
-1924; Beer-Lambert). Blending is linear, so it is exact for splats to let each Gaussian's colour through the air by itself, from
-its centre on, and to blend afterwards: every rasterizer shows it, as none knows of it.
+1924; Beer-Lambert). Blending is linear, so for splats it is exact to change the colour of each Gaussian for the way from its
+centre to the camera and to blend afterwards. Every rasterizer can show it and none needs to know of it.
 
-A medium that differs from place to place is sampled once for each camera, in froxels (Wronski, "Volumetric fog", SIGGRAPH
-2014): along a fan of rays, in slices that grow with distance. A Gaussian reads its optical depth between the rays, so that the
-cost hardly depends on their number.
+A medium that differs from place to place is sampled once for each camera in froxels (Wronski, "Volumetric fog", SIGGRAPH
+2014): along a fan of rays, in slices that grow with distance. The optical depth of a Gaussian is interpolated between the rays,
+so the cost hardly depends on the number of Gaussians.
 """
 
 from __future__ import annotations
@@ -24,31 +24,33 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]]
-"""Per scene unit, at points in scene units."""
+"""From points in scene units to the extinction per scene unit."""
 
-CLOSEST = 2.0  # pixels between rays, at least: small pictures do not show more
-BEYOND = 100.0  # times the farthest slice: as far as the air of the last slice goes on
+CLOSEST = 2.0  # pixels between rays, at least; small pictures do not show more
+BEYOND = 100.0  # the air of the last slice goes on to so many times the distance of its end
 
 
 @dataclass(frozen=True, kw_only=True)
 class Froxels:
-    """How finely the air before a camera is sampled, along its rays. Lengths in scene units.
+    """Resolution of the samples of the air in front of a camera. Lengths are in scene units.
 
-    In patches of 8 m, whose density deviates by half, the optical depth is off by 1 % (root mean square): what arrives differs
-    by less than 2 % of the light everywhere.
+    In patches of 8 m whose density deviates by half, the optical depth is off by 1 % (root mean square), and the light that
+    arrives by less than 2 % everywhere.
     """
 
     nearest: float = 0.4
-    """Thickness of the slice at the camera; each is thicker than the one before by the same factor."""
+    """Thickness of the slice at the camera; each slice is thicker than the one before by the same factor."""
     farthest: float = 400.0
-    """Where the last slice ends; beyond, the air goes on as in it."""
+    """Distance at which the last slice ends; the air beyond is as in the last slice."""
     slices: int = 64
+    """Number of slices along a ray."""
     rays: int = 44
-    """Across the wider side of the image, whatever its size: what counts is how far apart they are in the air. At 512 pixels
-    one in 12; in small pictures fewer, one in 2."""
+    """Number of rays across the wider side of the image, whatever its size, since the distance between rays in the air counts.
+    An image of 512 pixels has one ray in 12 pixels; small images have fewer rays, one in 2 pixels."""
     margin: float = 0.3
-    """How far the fan reaches beyond each side of the image, in halves of the image; still farther out its edge goes on. As far
-    as rasterizers project without distortion: of what lies beyond only wide tails come into view."""
+    """How far the fan of rays reaches beyond each side of the image, in halves of the image; still farther out the values of
+    its edge are used. The margin is where rasterizers stop projecting without distortion: of Gaussians beyond, only wide tails
+    come into view."""
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest * self.slices < self.farthest:
@@ -68,12 +70,12 @@ class Froxels:
         return float(root_scalar(excess, bracket=(1e-9, 600 / self.slices)).root)
 
     def edges(self, like: Tensor) -> Float[Tensor, " {self.slices}+2"]:
-        """Distances from the camera at which slices begin, then where the last one ends and where the air beyond it does."""
+        """Distances from the camera at which slices begin, then those at which the last slice and the air beyond it end."""
         within = self.nearest / math.expm1(self.growth) * torch.expm1(self.growth * torch.arange(self.slices + 1).to(like))
         return torch.cat([within, BEYOND * within[-1:]])
 
     def slots(self, distances: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Where distances lie among the edges, linear within each slice, so that even air is met exactly."""
+        """Positions of distances among the edges, linear within each slice, so that even air is sampled exactly."""
         at = torch.log1p(distances * (math.expm1(self.growth) / self.nearest)) / self.growth
         whole = at.detach().floor()
         within = whole + torch.expm1(self.growth * (at - whole)) / math.expm1(self.growth)
@@ -82,10 +84,16 @@ class Froxels:
 
 
 class Medium:
-    """The air of one moment; knows nothing of weather. May be asked from several threads."""
+    """The air of one moment; it knows nothing of weather. Several threads may use it."""
 
     def __init__(self, airlight: Float[Tensor, "3"], extinction: Extinction | float, froxels: Froxels | None = None) -> None:
-        """`extinction` per scene unit: a number for air that is the same everywhere, which needs no froxels and is exact.
+        """Keep the numbers; nothing is sampled before the first camera.
+
+        Args:
+            airlight: colour that the air adds.
+            extinction: per scene unit; a number stands for air that is the same everywhere, which needs no froxels and is
+                exact.
+            froxels: resolution of the samples.
 
         Raises:
             ValueError: a number is negative or not finite.
@@ -106,7 +114,16 @@ class Medium:
         width: int,
         height: int,
     ) -> Float[Tensor, "n 3"]:
-        """Colours as they arrive at the camera from `means`; differentiable in both."""
+        """Colours as they arrive at the camera; differentiable in `rgb` and `means`.
+
+        Args:
+            rgb: colours as they leave.
+            means: points that they leave from, in scene units.
+            viewmat: world to camera.
+            K: intrinsics in pixels.
+            width: of the image in pixels.
+            height: of the image in pixels.
+        """
         return self._mixed(rgb, self.optical_depth(means, viewmat, K, width, height)[:, None])
 
     def behind(
@@ -118,8 +135,15 @@ class Medium:
         height: int,
         far: float,
     ) -> Tensor:
-        """A background (black if None) at the distance `far` as it arrives: [3] where the air is the same everywhere, else
-        [h, w, 3].
+        """A background as it arrives at the camera: [3] if the air is the same everywhere, else [h, w, 3].
+
+        Args:
+            background: colour of the background; None is black.
+            viewmat: world to camera.
+            K: intrinsics in pixels.
+            width: of the image in pixels.
+            height: of the image in pixels.
+            far: distance of the background in scene units.
 
         Raises:
             ValueError: `far` is not a positive number of scene units.
@@ -146,14 +170,22 @@ class Medium:
         width: int,
         height: int,
     ) -> Float[Tensor, " n"]:
-        """The integral of the extinction from the camera's centre to each point; T = exp(-it)."""
+        """The integral of the extinction from the camera's centre to each point; T is exp of minus it.
+
+        Args:
+            means: points in scene units.
+            viewmat: world to camera.
+            K: intrinsics in pixels.
+            width: of the image in pixels.
+            height: of the image in pixels.
+        """
         viewmat, K = viewmat.to(means), K.to(means)
         points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         distances = points.norm(dim=1)
         if not callable(self.extinction):
             return self.extinction * distances
         depths = self._depths(viewmat, K, width, height)
-        # What is beside or behind the camera is not drawn; it only must not divide by zero.
+        # Points beside or behind the camera are not drawn; they only must not divide by zero.
         pixels = points[:, :2] / points[:, 2:].clamp_min(1e-6) * K.diagonal()[:2] + K[:2, 2]
         along = 2.0 * self.froxels.slots(distances) / (len(depths) - 1) - 1.0
         at = torch.cat([self._across(pixels, width, height), along[:, None]], dim=1)
@@ -164,7 +196,7 @@ class Medium:
         return rgb * torch.exp(-depth) - self.airlight.to(rgb) * torch.expm1(-depth)
 
     def _across(self, pixels: Float[Tensor, "*n 2"], width: int, height: int) -> Float[Tensor, "*n 2"]:
-        """Pixels in the fan of rays, -1..1, and no farther."""
+        """Positions of pixels in the fan of rays, clamped to -1..1."""
         half = 0.5 * torch.tensor([width, height]).to(pixels)
         return ((pixels / half - 1.0) / (1.0 + self.froxels.margin)).clamp(-1.0, 1.0)
 
@@ -172,9 +204,9 @@ class Medium:
     def _depths(
         self, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int
     ) -> Float[Tensor, "{self.froxels.slices}+2 rows columns"]:
-        """Optical depth at the edges of the slices along each ray of the fan; that of the last view is kept."""
+        """Optical depth at the edges of the slices along each ray of the fan; the result for the last view is kept."""
         view = viewmat.detach(), K.detach(), width, height
-        kept = self._sampled  # read once: another thread may put its own view there
+        kept = self._sampled  # it is read once, since another thread may put its own view there
         if kept is not None and _same(kept[0], view):
             return kept[1]
         rays = self._rays(*view)
@@ -190,7 +222,7 @@ class Medium:
         return depths
 
     def _rays(self, viewmat: Tensor, K: Tensor, width: int, height: int) -> Float[Tensor, "rows columns 3"]:
-        """Unit vectors of the fan in scene axes, from corner to corner."""
+        """Unit vectors of the rays in scene axes, row by row."""
         spacing = max(max(width, height) / self.froxels.rays, CLOSEST)
         reach = 0.5 * (1.0 + self.froxels.margin)
         x, y = (

@@ -1,7 +1,7 @@
-"""How a moment of the weather changes what a camera sees, apart from what moves: the frozen scene's answer, and the air.
+"""A moment of the weather: how it changes the look of the frozen scene, and the air in front of a camera.
 
-A rasterizer is handed a frozen scene once. What rain, snow and haze make of it is a function of time, and of the camera too
-(wet ground mirrors the sky, fog fades by distance); both act on a Gaussian's opacity, scales and colour before it is blended.
+A rasterizer gets the frozen scene once. The effect of rain, snow and haze on it depends on time and on the camera (wet ground
+mirrors the sky, fog fades by distance); it changes a Gaussian's opacity, scales and colour before the Gaussian is blended.
 """
 
 from __future__ import annotations
@@ -23,58 +23,78 @@ class Viewpoint(NamedTuple):
     viewmat: Float[Tensor, "4 4"]
     """World to camera, OpenCV."""
     K: Float[Tensor, "3 3"]
-    """Pixels."""
+    """Intrinsics in pixels."""
     width: int
+    """Pixels."""
     height: int
+    """Pixels."""
 
     @staticmethod
     def of(cameras: Cameras, k: int, like: Tensor) -> Viewpoint:
-        """The k-th camera, on the device and in the dtype of a tensor."""
+        """The k-th camera, on the device and in the dtype of the tensor `like`."""
         return Viewpoint(cameras.viewmats[k].to(like), cameras.Ks[k].to(like), cameras.width, cameras.height)
 
     @property
     def center(self) -> Float[Tensor, "3"]:
-        """Where the camera stands."""
+        """Position of the camera in scene units."""
         return torch.linalg.inv(self.viewmat.double())[:3, 3].to(self.viewmat)
 
 
 @runtime_checkable
 class Moment(Protocol):
-    """What a rasterizer asks of a moment; everything in scene units."""
+    """What a rasterizer needs to know of a moment; lengths are in scene units."""
 
     @property
     def key(self) -> bytes:
-        """Moments with the same key look the same: part of what a prepared view is known by."""
+        """Moments with the same key look the same; the key is a part of the key of a prepared view."""
         ...
 
     def altered(self, frozen: Gaussians) -> Gaussians:
-        """The frozen scene with other opacities and scales; its tensors are not touched."""
+        """The frozen scene with other opacities and scales; the tensors of `frozen` stay as they are."""
         ...
 
     def frozen_colors(
         self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], view: Viewpoint
     ) -> Float[Tensor, "m 3"]:
-        """Colours of the frozen Gaussians `ids`, from their own as this camera sees them; the air in between included."""
+        """Colours of frozen Gaussians as they arrive at a camera.
+
+        Args:
+            rgb: colours that the camera would see without weather.
+            means: centres.
+            ids: indices of the Gaussians in the frozen scene.
+            view: the camera.
+        """
         ...
 
     def moving_colors(self, rgb: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], view: Viewpoint) -> Float[Tensor, "n 3"]:
-        """Colours of what moves as they arrive through the air; differentiable in `rgb`."""
+        """Colours of dynamic Gaussians as they arrive at a camera through the air; differentiable in `rgb`.
+
+        Args:
+            rgb: colours as they leave.
+            means: centres.
+            view: the camera.
+        """
         ...
 
     def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
-        """What is seen where nothing is, [3] or [h, w, 3]; `own` without weather."""
+        """The background as a camera sees it, [3] or [h, w, 3].
+
+        Args:
+            own: the background without weather.
+            view: the camera.
+        """
         ...
 
 
 Moments: TypeAlias = Moment | Sequence[Moment | None] | None
-"""One for each camera, one for all, or none: then the frozen scene looks as it is."""
+"""One moment for each camera, one for all, or none: then the frozen scene looks as it is."""
 
 
 def moment_per_frame(moments: Moments, frames: int) -> list[Moment | None]:
     """The moment of each frame.
 
     Raises:
-        ValueError: there are not as many as frames.
+        ValueError: there are not as many moments as frames.
     """
     if moments is None or not isinstance(moments, Sequence):
         return [moments] * frames
@@ -86,7 +106,17 @@ def moment_per_frame(moments: Moments, frames: int) -> list[Moment | None]:
 def backgrounds(
     background: Float[Tensor, "3"] | None, cameras: Cameras, moments: Sequence[Moment | None], like: Tensor
 ) -> Tensor | None:
-    """What is behind each frame, [t, 1 or h, 1 or w, 3]; None where that is black everywhere."""
+    """The background of each frame.
+
+    Args:
+        background: the background without weather; None is black.
+        cameras: one for each frame.
+        moments: one for each frame.
+        like: tensor whose device and dtype the result has.
+
+    Returns:
+        `background` itself if there are no moments, otherwise [t, 1 or h, 1 or w, 3].
+    """
     if all(moment is None for moment in moments):
         return background
     own = torch.zeros(3).to(like) if background is None else background.to(like)

@@ -1,16 +1,16 @@
-"""Gaussians to the image plane: the elliptical footprint of each on the screen, and the way back for gradients.
+"""Projection of Gaussians to the image plane, where each has an elliptical footprint.
 
-Zwicker et al., "EWA Splatting" (2002): the perspective is linearised at the centre, so the footprint is again a Gaussian with
+The perspective is linearised at the centre (Zwicker et al., "EWA Splatting", 2002), so the footprint is again a Gaussian with
 covariance [[a, b], [b, c]]. Its exponent is kept as a sum of two squares, from the distribution of y and that of x given y,
 
     sigma(dx, dy) = 1/2 [ P (dx + S dy)^2 + Q dy^2 ],   P = 1 / (a - b^2 / c),  S = -b / c,  Q = 1 / c,
 
 which stays exact in single precision where the usual A dx^2 + 2 B dx dy + C dy^2 of a long thin splat cancels to noise. The
-projection itself runs in double precision: it is a small part of the time and judged against a float64 reference.
+projection itself runs in double precision: it is a small part of the time, and a float64 reference judges it.
 
-What moves by d while the shutter is open is smeared: a uniform distribution of length |d| has the variance |d|^2 / 12, so the
-motion enters the footprint like a fourth axis of that length. The smeared footprint is larger, its peak lower by
-sqrt(det / det'), so that the light it takes in all stays what it is on average over the exposure.
+A Gaussian that moves by d while the shutter is open is smeared: a uniform distribution of length |d| has the variance
+|d|^2 / 12, so the motion enters the footprint like a fourth axis of that variance. The smeared footprint is larger and its peak
+lower by sqrt(det / det'), so that it takes as much light as the moving Gaussian does on average over the exposure.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ OPACITY = 5
 RED, GREEN, BLUE = 6, 7, 8
 DEPTH = 9  # along the camera's z axis, scene units
 CUTOFF = 10  # largest sigma at which alpha reaches min_alpha
-LEFT, RIGHT, TOP, BOTTOM = 11, 12, 13, 14  # pixels that may be touched, end exclusive; LEFT = RIGHT where none
-DIMMING = 15  # what the opacity was multiplied with for the motion
+LEFT, RIGHT, TOP, BOTTOM = 11, 12, 13, 14  # pixels that may be touched, end exclusive; LEFT = RIGHT if there are none
+DIMMING = 15  # factor of the opacity for the motion
 COLUMNS = 16
 
 SMEAR = 1.0 / math.sqrt(12.0)
@@ -61,7 +61,14 @@ class Lens(NamedTuple):
 
 
 def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
-    """The lens of a camera with intrinsics `K` [3, 3]."""
+    """The lens of a camera.
+
+    Args:
+        K: [3, 3] intrinsics in pixels.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        config: the rules of projection.
+    """
     (focal_x, _, center_x), (_, focal_y, center_y) = K[:2].tolist()
     slack_x, slack_y = 0.5 * config.frustum_margin * width / focal_x, 0.5 * config.frustum_margin * height / focal_y
     return Lens(
@@ -86,7 +93,7 @@ def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
 
 @kernel(forceinline=True)
 def to_camera(viewmat, means, i):
-    """A point in camera axes."""
+    """Mean i in camera axes."""
     x = viewmat[0, 0] * means[i, 0] + viewmat[0, 1] * means[i, 1] + viewmat[0, 2] * means[i, 2] + viewmat[0, 3]
     y = viewmat[1, 0] * means[i, 0] + viewmat[1, 1] * means[i, 1] + viewmat[1, 2] * means[i, 2] + viewmat[1, 3]
     z = viewmat[2, 0] * means[i, 0] + viewmat[2, 1] * means[i, 1] + viewmat[2, 2] * means[i, 2] + viewmat[2, 3]
@@ -95,7 +102,7 @@ def to_camera(viewmat, means, i):
 
 @kernel(forceinline=True)
 def unit_quaternion(quats, i):
-    """w, x, y, z of length one, and the factor that made it so."""
+    """Quaternion i as w, x, y, z of length one, and the factor that it was scaled by."""
     w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     scale = 1.0 / math.sqrt(max(w * w + x * x + y * y + z * z, 1e-24))
     return w * scale, x * scale, y * scale, z * scale, scale
@@ -103,7 +110,7 @@ def unit_quaternion(quats, i):
 
 @kernel(forceinline=True)
 def principal_axes(viewmat, w, x, y, z):
-    """The three axes of a Gaussian with this rotation, in camera axes: one triple each."""
+    """The three principal axes of a Gaussian with this rotation, each a triple in camera axes."""
     xx, yy, zz = x * x, y * y, z * z
     first = (1 - 2 * (yy + zz), 2 * (x * y + w * z), 2 * (x * z - w * y))
     second = (2 * (x * y - w * z), 1 - 2 * (xx + zz), 2 * (y * z + w * x))
@@ -123,7 +130,7 @@ def turn(viewmat, v):
 
 @kernel(forceinline=True)
 def on_screen(axis, bend_x, bend_y, z, lens):
-    """A short vector in camera axes as pixels."""
+    """A short vector in camera axes projected to pixels."""
     return lens.focal_x / z * (axis[0] - bend_x * axis[2]), lens.focal_y / z * (axis[1] - bend_y * axis[2])
 
 
@@ -142,7 +149,7 @@ def covariance(axes, scales, i, bend_x, bend_y, z, lens):
 
 @kernel(forceinline=True)
 def _pixels(low, high, extent):
-    """Pixels whose centres lie in [low, high], clipped to the image: first and one past the last."""
+    """Pixels whose centres lie in [low, high], clipped to the image: the first, and one past the last."""
     first = min(max(math.ceil(low - 0.5), 0.0), float(extent))
     last = min(max(math.floor(high - 0.5) + 1.0, 0.0), float(extent))
     return first, last
@@ -158,7 +165,7 @@ def _tiles(low, high, extent):
 
 @kernel(forceinline=True)
 def _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
-    """Whether even a ball of this size would not touch the image; spares the rest for most of what is not seen."""
+    """Whether even a ball of this size would not touch the image; most Gaussians out of sight need no further work."""
     stretch = max(lens.focal_x, lens.focal_y) / z * size
     variance = lens.blur + stretch * stretch * (1.0 + bend_x * bend_x + bend_y * bend_y)
     reach = max(lens.radius_sigmas, 3.5) * math.sqrt(variance + 0.1) + 2.0
@@ -167,7 +174,7 @@ def _out_of_sight(px, py, size, bend_x, bend_y, z, lens):
 
 @kernel(forceinline=True)
 def _half_sides(a, b, c, cutoff, lens):
-    """Of the rectangle that decides which tiles are entered, whole pixels."""
+    """Half sides in whole pixels of the rectangle that decides which tiles a splat enters."""
     if lens.square:
         middle = 0.5 * (a + c)
         radius = math.ceil(lens.radius_sigmas * math.sqrt(middle + math.sqrt(max(0.01, middle * middle - a * c + b * b))))
@@ -178,7 +185,7 @@ def _half_sides(a, b, c, cutoff, lens):
 
 @kernel(forceinline=True)
 def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens, splats):
-    """Geometry of splat i."""
+    """Write the geometry of splat i."""
     splats[i, LEFT] = 0.0
     splats[i, RIGHT] = 0.0
     x, y, z = to_camera(viewmat, means, i)
@@ -200,7 +207,7 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens
         still = a * c - b * b
         u, v = on_screen(turn(viewmat, (motions[i, 0], motions[i, 1], motions[i, 2])), bend_x, bend_y, z, lens)
         u, v = SMEAR * u, SMEAR * v
-        # The determinant grows by this (matrix determinant lemma), without the cancellation of a c - b^2 in a thin streak.
+        # The determinant by the matrix determinant lemma, without the cancellation of a c - b^2 in a thin streak.
         grown = still + c * u * u - 2.0 * b * u * v + a * v * v
         a, b, c = a + u * u, b + u * v, c + v * v
         dimming = math.sqrt(still / grown)
@@ -234,7 +241,7 @@ def project(
     lens: Lens,
     splats: np.ndarray,  # [n, 16] float32, written
 ) -> None:
-    """Fill the geometry of `splats`; colours are left alone."""
+    """Write the geometry of all splats and leave their colours as they are."""
     share_out(_project, workers(), means, quats, scales, opacities, motions, viewmat, lens, splats)
 
 

@@ -1,4 +1,4 @@
-"""The way back through the projection: gradients of Gaussians from those of their footprints, in double precision."""
+"""The backward pass of the projection: gradients of Gaussians from those of their footprints, in double precision."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from pgsd_nerfstudio.rendering.projection import (
 )
 
 GRADIENT_COLUMNS = 10
-"""Columns of the gradient of a splat: those of the splat up to DEPTH."""
+"""Columns of the gradient of a splat: those of a splat up to DEPTH."""
 
 
 @kernel(forceinline=True)
 def _axis_backward(i, k, axis, scales, g_a, g_b, g_c, bend_x, bend_y, z, viewmat, lens, to_scales, g_z, g_bend_x, g_bend_y):
-    """Gradient of principal axis k in the world; writes that of its scale, adds to those of depth and linearisation."""
+    """Gradient of principal axis k in the world; also writes that of its scale and adds to those of depth and linearisation."""
     u, v = on_screen(axis, bend_x, bend_y, z, lens)
     size = np.float64(scales[i, k])
     g_u = (2.0 * g_a * u + g_b * v) * size
@@ -53,7 +53,10 @@ def _axis_backward(i, k, axis, scales, g_a, g_b, g_c, bend_x, bend_y, z, viewmat
 
 @kernel(forceinline=True)
 def _to_quaternion(i, p, q, r, qw, qx, qy, qz, quat_scale, to_quats):
-    """Rotation matrix (columns p, q, r) -> quaternion, of which only the direction counts: without the part along it."""
+    """Write the gradient of a quaternion from that of its rotation matrix, whose columns are p, q, r.
+
+    Only the direction of a quaternion counts, so its gradient has no part along the quaternion.
+    """
     g_w = 2.0 * (qx * (q[2] - r[1]) + qy * (r[0] - p[2]) + qz * (p[1] - q[0]))
     g_i = 2.0 * (-2.0 * qx * (q[1] + r[2]) + qy * (p[1] + q[0]) + qz * (p[2] + r[0]) + qw * (q[2] - r[1]))
     g_j = 2.0 * (qx * (p[1] + q[0]) - 2.0 * qy * (p[0] + r[2]) + qz * (q[2] + r[1]) + qw * (r[0] - p[2]))
@@ -83,7 +86,7 @@ def _project_one_backward(
     to_scales,
     to_motions,
 ):
-    """Gradients of Gaussian i, which is splat m."""
+    """Write the gradients of Gaussian i, which is splat m."""
     x, y, z = to_camera(viewmat, means, i)
     slope_x, slope_y = x / z, y / z
     bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
@@ -91,7 +94,7 @@ def _project_one_backward(
     axes = principal_axes(viewmat, qw, qx, qy, qz)
     a, b, c = covariance(axes, scales, i, bend_x, bend_y, z, lens)
 
-    # With motion the splat's covariance is a0 + u^2, b0 + u v, c0 + v^2 of the still one and the motion's standard deviation.
+    # With motion, the covariance is a0 + u^2, b0 + u v, c0 + v^2: the still one and the motion's standard deviation u, v.
     a0, b0, c0, u, v = a, b, c, 0.0, 0.0
     if moves:
         way = turn(viewmat, (motions[i, 0], motions[i, 1], motions[i, 2]))
@@ -99,7 +102,7 @@ def _project_one_backward(
         u, v = SMEAR * u, SMEAR * v
         a, b, c = a + u * u, b + u * v, c + v * v
 
-    # P, S, Q -> covariance.
+    # From P, S, Q to the covariance.
     precision = 1.0 / (a - b * b / c)
     g_a = -precision * precision * gradients[m, PRECISION]
     g_b = -2.0 * b / c * g_a - gradients[m, SHEAR] / c
@@ -108,7 +111,7 @@ def _project_one_backward(
     g_bend_x, g_bend_y, g_z = 0.0, 0.0, np.float64(gradients[m, DEPTH])
     stretch_x, stretch_y = lens.focal_x / z, lens.focal_y / z
     if moves:
-        # The opacity was multiplied with sqrt(still / smeared): log-derivatives of the two determinants.
+        # The opacity was multiplied by sqrt(still / smeared); these are log-derivatives of the two determinants.
         half = 0.5 * gradients[m, OPACITY] * splats[m, OPACITY]
         still, smeared = half / (a0 * c0 - b0 * b0), half / (a * c - b * b)
         g_a, g_b, g_c = g_a - smeared * c, g_b + 2.0 * smeared * b, g_c - smeared * a
@@ -122,7 +125,7 @@ def _project_one_backward(
             to_motions[i, n] = viewmat[0, n] * g_x + viewmat[1, n] * g_y + viewmat[2, n] * g_w
         g_a, g_b, g_c = g_a + still * c0, g_b - 2.0 * still * b0, g_c + still * a0
 
-    # Covariance -> the projected axes -> scales, linearisation, and the axes in the world.
+    # From the covariance to the projected axes, then to scales, linearisation and the axes in the world.
     first, g_z, g_bend_x, g_bend_y = _axis_backward(
         i, 0, axes[0], scales, g_a, g_b, g_c, bend_x, bend_y, z, viewmat, lens, to_scales, g_z, g_bend_x, g_bend_y
     )
@@ -134,7 +137,8 @@ def _project_one_backward(
     )
     _to_quaternion(i, first, second, third, qw, qx, qy, qz, quat_scale, to_quats)
 
-    # Centre on the screen -> slopes -> camera space -> world. A slope at its limit takes nothing from the linearisation.
+    # From the centre on the screen to slopes, camera axes and the world. A slope at its limit gets no gradient from the
+    # linearisation.
     g_slope_x, g_slope_y = lens.focal_x * gradients[m, X], lens.focal_y * gradients[m, Y]
     if bend_x == slope_x:
         g_slope_x += g_bend_x

@@ -1,7 +1,7 @@
-"""The judge: the same picture in plain float64 torch, differentiable by autograd, as slow as it is short.
+"""The reference rasterizer: the same picture in plain float64 torch, differentiable by autograd, short and slow.
 
-Written after gsplat's CUDA sources (1.4.0: fully_fused_projection_fwd.cu, isect_tiles.cu, rasterize_to_pixels_fwd.cu; 1.5:
-ProjectionEWA3DGSFused.cu for rectangles), with nothing of the numba kernels. Never a default.
+It follows gsplat's CUDA sources (1.4.0: fully_fused_projection_fwd.cu, isect_tiles.cu, rasterize_to_pixels_fwd.cu; 1.5:
+ProjectionEWA3DGSFused.cu for rectangles) and shares nothing with the numba kernels, which it judges. It is never a default.
 """
 
 from __future__ import annotations
@@ -32,19 +32,29 @@ class Projection(NamedTuple):
     covariances: Float[Tensor, "n 2 2"]
     """Pixels squared, blur and motion included."""
     depths: Float[Tensor, " n"]
+    """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure where the Gaussian moves."""
+    """Averaged over the exposure if the Gaussian moves."""
     radii: Float[Tensor, "n 2"]
-    """Half sides of the footprint along x and y in whole pixels, 0 where the Gaussian is not drawn."""
+    """Half sides of the footprint along x and y in whole pixels, 0 if the Gaussian is not drawn."""
 
 
 def project_reference(
     gaussians: Gaussians, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int, config: RasterConfig
 ) -> Projection:
-    """EWA projection; Gaussians, `viewmat` and `K` share their dtype."""
+    """Project Gaussians by EWA splatting.
+
+    Args:
+        gaussians: in the dtype of `viewmat` and `K`.
+        viewmat: world to camera.
+        K: intrinsics in pixels.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        config: the rules of projection.
+    """
     points = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = (points[:, 2] >= config.near) & (points[:, 2] <= config.far)
-    # What is not drawn must not divide by zero, neither here nor in the gradient.
+    # Gaussians that are not drawn must not divide by zero, neither here nor in the gradient.
     points = torch.where(seen[:, None], points, torch.tensor([0.0, 0.0, 1.0]).to(points))
     centers = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
     to_image = perspective_jacobians(points, K, width, height, config.frustum_margin) @ viewmat[:3, :3]
@@ -68,7 +78,7 @@ def _determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, " n"]:
 def _half_sides(
     covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"], config: RasterConfig
 ) -> Float[Tensor, "n 2"]:
-    """Of the footprint, whole pixels."""
+    """Half sides of the footprint in whole pixels."""
     variances = covariances.diagonal(dim1=1, dim2=2)
     if config.footprint == "square":
         mean = variances.mean(dim=1, keepdim=True)
@@ -89,7 +99,7 @@ def _enters(projection: Projection, left: int, top: int) -> Bool[Tensor, " n"]:
 def _blend(
     pixels: Float[Tensor, "p 2"], projection: Projection, colors: Float[Tensor, "n 3"], config: RasterConfig
 ) -> Float[Tensor, "p 5"]:
-    """Red, green, blue, weighted depth and accumulation at pixel centres; Gaussians come nearest first."""
+    """Red, green, blue, weighted depth and accumulation at pixel centres, of Gaussians that are given nearest first."""
     dx, dy = (pixels[:, None, :] - projection.centers).unbind(-1)
     a, b, c = projection.covariances.flatten(1)[:, [0, 1, 3]].unbind(-1)
     sigma = (0.5 * (c * dx**2 + a * dy**2) - b * dx * dy) / _determinants(projection.covariances)
@@ -97,7 +107,7 @@ def _blend(
     alpha = torch.where(alpha >= config.min_alpha, alpha, 0.0)
     after = torch.cumprod(1.0 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    # Light only falls along the ray, so all behind the first Gaussian that lets too little through is cut off with it.
+    # Light only decreases along the ray, so the first Gaussian that lets too little through cuts off all behind it too.
     weights = torch.where(after > config.min_transmittance, alpha * before, torch.zeros_like(alpha))
     return weights @ torch.cat([colors, projection.depths[:, None], torch.ones_like(projection.depths)[:, None]], dim=1)
 
@@ -111,11 +121,17 @@ def render_reference(
     moments: Moments = None,
     dtype: torch.dtype = torch.float64,
 ) -> Rendering:
-    """Render one set, or several (each with plain RGB or harmonics) as one scene; differentiable in all of them.
+    """Render one or several sets of Gaussians as one scene; differentiable in all of them.
 
-    Of several the first is the frozen scene, for `moments` that tell it from what moves.
-    Gaussians of equal depth are drawn in the order given. In float64 it is the judge; with `dtype` float32 it stands in
-    benches for a vectorised torch rasterizer of the same conventions.
+    Gaussians of equal depth are drawn in the order given.
+
+    Args:
+        cameras: one for each frame.
+        gaussians: one set or several, each with plain RGB or harmonics; the first is the frozen scene for `moments`.
+        background: colour behind all Gaussians; None is black.
+        config: conventions of the picture; gsplat 1.4.0's by default.
+        moments: as for `Rasterizer.render`.
+        dtype: float64 to judge others; in float32 it stands for a vectorised torch rasterizer in benches.
     """
     config = config or RasterConfig()
     sets = [one.to(dtype) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
@@ -129,10 +145,15 @@ def render_reference(
 def certain_pixels(
     cameras: Cameras, gaussians: Gaussians | Sequence[Gaussians], margin: float = 2e-5, config: RasterConfig | None = None
 ) -> Bool[Tensor, "t h w"]:
-    """Pixels where no decision (drawn or not, finished or not) hangs on the last digits of single precision.
+    """Pixels in which no decision (drawn or not, finished or not) depends on the last digits of single precision.
 
-    Elsewhere two exact rasterizers may differ by a whole step. Found by moving the thresholds by the relative `margin`: certain
-    pixels stay as they are.
+    In other pixels two exact rasterizers may differ by a whole step.
+
+    Args:
+        cameras: one for each frame.
+        gaussians: one set or several, as for `render_reference`.
+        margin: relative change of the thresholds that leaves certain pixels as they are.
+        config: conventions of the picture.
     """
     config = config or RasterConfig()
     before = render_reference(cameras, gaussians, config=config).accumulation
@@ -168,7 +189,7 @@ def _render_frame(
                 x = torch.arange(left, min(left + TILE, cameras.width))
                 pixels = torch.cartesian_prod(y, x).flip(-1).to(viewmat) + 0.5
                 here = Projection(*(t[chosen] for t in projection))
-                # Intermediate values are made again on the way back: kept, those of one large scene would fill the memory.
+                # The backward pass computes intermediate values again: those of one large scene would fill the memory.
                 tile = checkpoint(_blend, pixels, here, colors[chosen], config, use_reentrant=False)
                 image[y[0] : y[-1] + 1, x[0] : x[-1] + 1] = tile.view(len(y), len(x), 5)
     return image

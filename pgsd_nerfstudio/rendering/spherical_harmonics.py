@@ -1,6 +1,6 @@
 """View-dependent colours: real spherical harmonics in the basis and sign convention of 3D Gaussian splatting.
 
-Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2(2), 2013; degrees 0 to 4 as in gsplat 1.4.0.
+The evaluation follows Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2(2), 2013; degrees are 0 to 4 as in gsplat 1.4.0.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def view_colors(
     means: Float[Tensor, "n 3"],
     viewmat: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "n 3"]:
-    """RGB of Gaussians seen by one camera: plain colours as they are, harmonics as max(sum + 0.5, 0)."""
+    """RGB of Gaussians as one camera sees them: plain colours unchanged, harmonics as max(sum + 0.5, 0)."""
     if colors.ndim == 2:
         return colors
     center = torch.linalg.inv(viewmat.double())[:3, 3].to(means)

@@ -1,4 +1,4 @@
-"""Random scenes on which rasterizers are compared, in `pgsd verify`, `pgsd bench` and the tests."""
+"""Random scenes on which `pgsd verify`, `pgsd bench` and the tests compare rasterizers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
 def random_cameras(frames: int, width: int, height: int, seed: int = 0) -> Cameras:
-    """Cameras about the origin that look along z, each a little turned, with unequal focal lengths and an off-centre axis."""
+    """Cameras near the origin that look along z, each slightly rotated, with unequal focal lengths and an off-centre axis.
+
+    Args:
+        frames: number of cameras.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        seed: of the random poses.
+    """
     generator = torch.Generator().manual_seed(seed)
     turn = 0.15 * torch.randn(frames, 3, generator=generator)
     skew = torch.zeros(frames, 3, 3)
@@ -25,7 +32,15 @@ def random_cameras(frames: int, width: int, height: int, seed: int = 0) -> Camer
 def random_gaussians(
     n: int, seed: int = 0, *, degree: int | None = None, size: float = 0.15, opacity: float = 1.0
 ) -> Gaussians:
-    """Gaussians before, beside and behind the cameras, from pin pricks to splats that cover the image; some of them opaque."""
+    """Gaussians in front of, beside and behind the cameras, from points to splats that cover the image.
+
+    Args:
+        n: number of Gaussians.
+        seed: of all their random numbers.
+        degree: of spherical harmonics; None gives plain RGB.
+        size: median scale in scene units.
+        opacity: largest opacity, which the first tenth of the Gaussians has.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -40,5 +55,5 @@ def random_gaussians(
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Relative L2 distance."""
+    """L2 norm of the difference over that of the expected tensor."""
     return ((found.double() - expected).norm() / expected.norm()).item()

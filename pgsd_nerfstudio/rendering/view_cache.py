@@ -1,4 +1,4 @@
-"""What was prepared for a camera, kept as long as there is room."""
+"""Views that were prepared for cameras, kept as long as there is room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Sized(Protocol):
-    """Something that knows the memory it holds."""
+    """An object that knows how many bytes it holds."""
 
     @property
     def nbytes(self) -> int: ...
@@ -24,12 +24,17 @@ V = TypeVar("V", bound=Sized)
 
 
 class ViewCache(Generic[V]):
-    """Views by camera; the least recently used are forgotten beyond `cache_bytes`. May be asked from several threads."""
+    """Prepared views by camera; the least recently used are dropped beyond `cache_bytes`. Several threads may use a cache."""
 
     def __init__(self, cache_bytes: int) -> None:
+        """Start without views.
+
+        Args:
+            cache_bytes: memory for all views.
+        """
         self.cache_bytes = cache_bytes
         self.nbytes = 0
-        """Memory held now."""
+        """Bytes that the views hold now."""
         self._views: OrderedDict[bytes, V] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -48,7 +53,16 @@ class ViewCache(Generic[V]):
         make: Callable[[], V],
         moment: bytes = b"",
     ) -> V:
-        """The view of a camera at a moment, made if it is not held."""
+        """The view of a camera at a moment, made if it is not kept.
+
+        Args:
+            viewmat: world to camera.
+            K: intrinsics in pixels.
+            width: of the image in pixels.
+            height: of the image in pixels.
+            make: makes the view.
+            moment: key of the moment.
+        """
         numbers = torch.cat([viewmat.flatten(), K.flatten()]).detach().cpu().double().numpy()
         key = numbers.tobytes() + f"{width}x{height}".encode() + moment
         with self._lock:
