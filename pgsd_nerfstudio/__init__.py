@@ -15,6 +15,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from pgsd_nerfstudio.version import __version__
+
 if TYPE_CHECKING:
     from pgsd_nerfstudio.effects.effect import Effect, effect
     from pgsd_nerfstudio.effects.options import EffectOptions
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.weather.picture import Picture
     from pgsd_nerfstudio.weather.video import write_video
     from pgsd_nerfstudio.weather.weather import Weather
-
-__version__ = "0.2.0"
 
 __all__ = [
     "Cameras",

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from plugin_scene import HEIGHT, VIEWS, WIDTH, write_scene
+from plugin_scene import HEIGHT, VIEWS, WIDTH, grouped, write_scene
 
 from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig, partners
-from pgsd_nerfstudio.plugin.options import WeatherOptions
+from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.storage import cache_dir
 
 CLIP = {"clip_frames": 5, "clip_height": 16, "clip_width": 24}
@@ -16,7 +16,7 @@ CLIP = {"clip_frames": 5, "clip_height": 16, "clip_width": 24}
 @pytest.fixture(scope="module")
 def manager(tmp_path_factory: pytest.TempPathFactory) -> TrajectoryDataManager:
     ply = write_scene(tmp_path_factory.mktemp("scene"))
-    options = WeatherOptions(load_scene=ply, data=ply.parent, seconds=0.8, **CLIP)
+    options = grouped(RunOptions(), {"load_scene": ply, "data": ply.parent, "seconds": 0.8, **CLIP})
     return TrajectoryDataManagerConfig(options=options).setup()
 
 
@@ -75,6 +75,6 @@ def test_photographs_come_in_the_size_of_their_camera(tmp_path: Path):
     ply = write_scene(tmp_path)
     for index in range(VIEWS):
         Image.new("RGB", (2 * WIDTH, 2 * HEIGHT), (10 * index, 0, 0)).save(tmp_path / f"{index}.png")
-    manager = TrajectoryDataManagerConfig(options=WeatherOptions(load_scene=ply, data=tmp_path, **CLIP)).setup()
+    manager = TrajectoryDataManagerConfig(options=grouped(RunOptions(), {"load_scene": ply, "data": tmp_path, **CLIP})).setup()
     image = manager.train_dataset[4]["image"]
     assert image.shape == (HEIGHT, WIDTH, 3) and image[0, 0].tolist() == pytest.approx([40 / 255, 0, 0])

@@ -279,7 +279,7 @@ def test_every_ablation_of_the_paper_trains_and_opens(trained: Path, prior: Path
     if flags.get("collisions") is False:
         assert not model.history.collided.any()
     if flags.get("dynamics") == FieldConfig(velocity=False, rotation=False):
-        offsets = [rolled.offset.abs().max() for rolled in model.rollout.frames() if len(rolled.offset)]
+        offsets = [instant.offset.abs().max() for instant in model.rollout.frames() if len(instant.offset)]
         assert max(offsets) == 0
 
 

@@ -68,7 +68,7 @@ def lesson():
                 group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * step / STEPS))
             which = step % len(PATHS)
             rolled = rollout.window(PATHS[which][2], frames, begin="simulation")
-            weather = [scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
+            weather = [scene.frame.gaussians_to_scene(one.gaussians) for one in instants]
             clip = rasterizer.render(paths[which], weather).rgb.permute(0, 3, 1, 2)
             guidance, scale = torch.zeros(()), 1.0
             if taught:
@@ -77,7 +77,7 @@ def lesson():
                 distilled = distill_clip(prior, seen, text, against, timestep, config=DistillationConfig(), generator=generator)
                 guidance = (clip * distilled.gradient).sum()
                 scale = regularization_scale("adaptive", distilled.loss)
-            loss = guidance + RegularizationWeights().total(regularization(rolled, look), scale)
+            loss = guidance + RegularizationWeights().total(regularization(instants, look), scale)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

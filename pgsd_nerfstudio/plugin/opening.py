@@ -12,10 +12,10 @@ from pgsd_nerfstudio.dynamics import scattered
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.scene.loading import load_scene
-from pgsd_nerfstudio.weather.making import assemble_weather, make_weather
+from pgsd_nerfstudio.weather.making import make_weather
 from pgsd_nerfstudio.weather.options import SceneOptions
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
-from pgsd_nerfstudio.weather.stored import StoredWeatherError, open_weather
+from pgsd_nerfstudio.weather.stored import StoredWeatherError
 from pgsd_nerfstudio.weather.weather import Weather
 
 
@@ -73,7 +73,7 @@ def stored_weather(prepared: PreparedScene, options: RunOptions, run_folder: Pat
         RunError: the run's copy is missing or damaged, or the scene is no longer the one for which it was made.
     """
     try:
-        return open_weather(prepared, run_folder or Path())
+        return Weather.open_prepared(run_folder or Path(), prepared)
     except StoredWeatherError as error:
         raise RunError(f"{error}; or make it again with: {options.command()}") from error
 
@@ -84,4 +84,4 @@ def _without_simulation(weather: Weather) -> Weather:
     domain = torch.tensor(history.about["domain"]).reshape(2, 3)
     count = int(((history.births <= 0) & (history.ends > 0)).sum()) or len(history)
     spread = replace(scattered(domain, history, count, seed=weather.options.seed), about=history.about)
-    return assemble_weather(weather.prepared, weather.effect, weather.options, spread, weather.answer)
+    return Weather.untrained(weather.prepared, weather.effect, weather.options, spread, weather.answer)

@@ -16,13 +16,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from pgsd_nerfstudio import __version__
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.effects.language_model import Understanding
 from pgsd_nerfstudio.effects.options import EffectOptions
 from pgsd_nerfstudio.effects.request import Request
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.training_options import CUDA, ClipOptions, GuidanceOptions, LearningOptions, MotionOptions
+from pgsd_nerfstudio.version import __version__
 from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions, SceneOptions, SimulationOptions
 
 

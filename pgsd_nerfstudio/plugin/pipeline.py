@@ -138,8 +138,8 @@ class WeatherPipeline(VanillaPipeline):
             # What is deformed is not where it was scattered.
             seen = None if options.motion.motion == "deformation" else seen_by(prepared, views, model.history, start)
             how = {"begin": options.motion.begin, "gradient_frames": options.motion.gradient_frames}
-            rolled = model.rollout.window(start, len(views), visible=seen, **how)
-            weather = [prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in rolled]
+            instants = model.rollout.window(start, len(views), visible=seen, **how)
+            weather = [prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in instants]
         with watch("render"):
             answering = options.answering_clips
             moments = [model.moment(start + k) if answering else None for k in range(len(views))]
@@ -153,11 +153,11 @@ class WeatherPipeline(VanillaPipeline):
             video, norms = surrogate(prepared, views, weather, background, moments, distilled.gradient)
         weights = options.motion.regularization
         with watch("regularize"):
-            terms = regularization(rolled, model.look, weights.form)
+            terms = regularization(instants, model.look, weights.form)
             scale = regularization_scale(options.motion.weights, distilled.loss, step, options.training_steps)
             losses = weights.weighted(terms, scale)
         with torch.no_grad():
-            metres = drift(rolled)
+            metres = drift(instants)
         if options.clips.clip_every and step % options.clips.clip_every == 0:
             writer.put_image("clip", torch.cat(list(clip), dim=2).permute(1, 2, 0).cpu(), step)
         # The number shown is |L_SDS|, the gradient that of the surrogate.

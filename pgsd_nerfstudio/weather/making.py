@@ -6,12 +6,10 @@ from pathlib import Path
 
 import torch
 
-from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
-from pgsd_nerfstudio.effects import Effect, InitialLook, effect, initial_look
+from pgsd_nerfstudio.effects import Effect, effect
 from pgsd_nerfstudio.physics.motion_prior import Profile, motion_prior
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.response.answer import Answer
-from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.response.prepare import answer_of, edits_of
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
@@ -100,7 +98,7 @@ def make_weather(
     surface = surface_of(prepared.scene, prepared.rasterizer)
     history = motion_of(prepared, surface, effect, options, progress=progress).to(prepared.device)
     answer = answer_to(prepared, surface, effect, options, edited_images=edited_images)
-    return assemble_weather(prepared, effect, options, history, answer)
+    return Weather.untrained(prepared, effect, options, history, answer)
 
 
 def motion_of(
@@ -163,34 +161,3 @@ def answer_to(
     scene, device, seed = prepared.scene, prepared.device, options.seed
     edits = None if edited_images is None else edits_of(scene, edited_images, device, seed=seed)
     return answer_of(scene, surface, effect, seconds=options.seconds, seed=seed, edits=edits).to(device)
-
-
-def assemble_weather(
-    prepared: PreparedScene, effect: Effect, options: SimulationOptions, history: ParticleHistory, answer: Answer
-) -> Weather:
-    """A weather of which nothing is learned: the simulated motion and the initial look, bit for bit.
-
-    Args:
-        prepared: the scene on a device.
-        effect: the weather.
-        options: how the motion was simulated.
-        history: the motion in metres.
-        answer: of the frozen scene.
-    """
-    look = look_of(prepared.scene, effect, history, answer, seed=options.seed)
-    sequence = Rollout(history, look, DynamicsField.for_history(history), exposure=effect.appearance.exposure)
-    return Weather(prepared, effect, options, history, answer, sequence)
-
-
-def look_of(scene: Scene, effect: Effect, history: ParticleHistory, answer: Answer, *, seed: int) -> InitialLook:
-    """The initial look of all particles; collided ones are in the light of their place.
-
-    Args:
-        scene: the frozen scene.
-        effect: the weather.
-        history: the motion in metres.
-        answer: of the frozen scene, on the device of `history`.
-        seed: of the spread from particle to particle.
-    """
-    look = initial_look(effect, history, seed=seed)
-    return in_place(look, history, answer, scene.frame.to_metric(scene.gaussians.means))

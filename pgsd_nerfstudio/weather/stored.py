@@ -7,25 +7,22 @@ version's way of estimating it.
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from pgsd_nerfstudio import __version__
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.prepare import save_answer, stored_answer
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.scene import Scene
-from pgsd_nerfstudio.storage import content_key
-from pgsd_nerfstudio.weather.making import assemble_weather
+from pgsd_nerfstudio.storage import atomic_write, content_key
+from pgsd_nerfstudio.version import __version__
 from pgsd_nerfstudio.weather.options import SimulationOptions
-from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
-from pgsd_nerfstudio.weather.weather import Weather
 
 MOTION_FILE, ANSWER_FILE, DESCRIPTION_FILE = "motion_prior.safetensors", "answer.safetensors", "weather.json"
 
@@ -34,31 +31,41 @@ class StoredWeatherError(ValueError):
     """A stored weather that cannot be opened: which file is wrong, and how."""
 
 
-def save_weather(weather: Weather, folder: Path) -> Path:
-    """Write a weather into a folder, which is made if need be; returns it.
+class StoredWeather(NamedTuple):
+    """The parts of a weather that are stored; the scene stays where it is."""
 
-    Raises:
-        OSError: it could not be written.
-    """
-    scene = weather.scene
-    made_for = {"splat": _splat_key(scene), "frame": _plain(scene.frame)}
-    history = replace(weather.history, about={**weather.history.about, **made_for})
-    folder.mkdir(parents=True, exist_ok=True)
-    history.save(folder / MOTION_FILE)
-    save_answer(folder / ANSWER_FILE, weather.answer)
-    description = {"version": __version__, "effect": asdict(weather.effect), "options": asdict(weather.options)}
-    beside = folder / f".{DESCRIPTION_FILE}.{os.getpid()}"
-    beside.write_text(json.dumps(description, indent=1, ensure_ascii=False) + "\n", "utf-8")
-    beside.replace(folder / DESCRIPTION_FILE)
-    return folder
+    effect: Effect
+    options: SimulationOptions
+    history: ParticleHistory
+    answer: Answer
 
 
-def open_weather(prepared: PreparedScene, folder: Path) -> Weather:
-    """The weather of a folder, on the device of the prepared scene and in the metric frame in which it was made.
+def save_parts(folder: Path, scene: Scene, parts: StoredWeather) -> None:
+    """Write the parts of a weather into a folder, which is made if need be.
 
     Args:
-        prepared: the scene for which it was made; its own metric frame is replaced by the stored one.
-        folder: of `save_weather`.
+        folder: where they go.
+        scene: for which they were made; its metric frame is stored with the motion.
+        parts: what is stored.
+
+    Raises:
+        OSError: a file could not be written.
+    """
+    made_for = {"splat": _splat_key(scene), "frame": _plain(scene.frame)}
+    folder.mkdir(parents=True, exist_ok=True)
+    replace(parts.history, about={**parts.history.about, **made_for}).save(folder / MOTION_FILE)
+    save_answer(folder / ANSWER_FILE, parts.answer)
+    description = {"version": __version__, "effect": asdict(parts.effect), "options": asdict(parts.options)}
+    with atomic_write(folder / DESCRIPTION_FILE) as beside:
+        beside.write_text(json.dumps(description, indent=1, ensure_ascii=False) + "\n", "utf-8")
+
+
+def open_parts(folder: Path, scene: Scene) -> tuple[StoredWeather, Frame]:
+    """The parts of a weather on the CPU, and the metric frame in which they were made.
+
+    Args:
+        folder: of `save_parts`.
+        scene: for which they were made.
 
     Raises:
         StoredWeatherError: a file is missing, damaged or of another version, or the scene is another one.
@@ -68,16 +75,16 @@ def open_weather(prepared: PreparedScene, folder: Path) -> Weather:
     history = ParticleHistory.load(motion)
     if history is None or not {"splat", "frame"} <= set(history.about):
         raise StoredWeatherError(f"the motion prior {motion} is missing or damaged")
-    if history.about["splat"] != _splat_key(prepared.scene):
+    if history.about["splat"] != _splat_key(scene):
         raise StoredWeatherError(
             f"this is not the scene for which {folder} was made: its Gaussians or cameras have changed; put the former one back"
         )
-    prepared = replace(prepared, scene=replace(prepared.scene, frame=_frame(history.about["frame"])))
+    frame = _frame(history.about["frame"])
     kept = folder / ANSWER_FILE
-    answer = stored_answer(kept, prepared.scene, effect, seconds=options.seconds, seed=options.seed)
+    answer = stored_answer(kept, replace(scene, frame=frame), effect, seconds=options.seconds, seed=options.seed)
     if answer is None:
         raise StoredWeatherError(f"the scene's answer {kept} is missing or damaged")
-    return assemble_weather(prepared, effect, options, history.to(prepared.device), answer.to(prepared.device))
+    return StoredWeather(effect, options, history, answer), frame
 
 
 def _description(path: Path) -> tuple[Effect, SimulationOptions]:

@@ -10,17 +10,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
-from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.effects import Effect, initial_look
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.response.answer import Answer, Shown
+from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.weather.options import SimulationOptions
 from pgsd_nerfstudio.weather.picture import Picture, picture_of
-from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
+from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
+from pgsd_nerfstudio.weather.stored import StoredWeather, open_parts, save_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +39,25 @@ class Weather:
     """How the frozen scene looks under the weather."""
     sequence: GaussianSequence
     """What is shown of the motion: as simulated, or with what training has learned."""
+
+    @staticmethod
+    def untrained(
+        prepared: PreparedScene, effect: Effect, options: SimulationOptions, history: ParticleHistory, answer: Answer
+    ) -> Weather:
+        """A weather of which nothing is learned: the simulated motion and the initial look, bit for bit.
+
+        Args:
+            prepared: the scene on a device.
+            effect: the weather.
+            options: how the motion was simulated.
+            history: the motion in metres, on that device.
+            answer: of the frozen scene, on that device.
+        """
+        scene = prepared.scene
+        look = initial_look(effect, history, seed=options.seed)
+        look = in_place(look, history, answer, scene.frame.to_metric(scene.gaussians.means))
+        sequence = Rollout(history, look, DynamicsField.for_history(history), exposure=effect.appearance.exposure)
+        return Weather(prepared, effect, options, history, answer, sequence)
 
     @property
     def scene(self) -> Scene:
@@ -150,9 +172,9 @@ class Weather:
         Raises:
             OSError: it could not be written.
         """
-        from pgsd_nerfstudio.weather.stored import save_weather
-
-        return save_weather(self, Path(folder))
+        folder = Path(folder)
+        save_parts(folder, self.scene, StoredWeather(self.effect, self.options, self.history, self.answer))
+        return folder
 
     @staticmethod
     def open(folder: str | Path, scene: Scene, device: torch.device | str | None = None) -> Weather:
@@ -164,9 +186,14 @@ class Weather:
             device: cpu or cuda; by default cuda where there is one.
 
         Raises:
-            ValueError: a file is missing or damaged, of another version, or the scene is another one.
+            StoredWeatherError: a file is missing or damaged, of another version, or the scene is another one.
         """
-        from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
-        from pgsd_nerfstudio.weather.stored import open_weather
+        return Weather.open_prepared(folder, prepare_scene(scene, device))
 
-        return open_weather(prepare_scene(scene, device), Path(folder))
+    @staticmethod
+    def open_prepared(folder: str | Path, prepared: PreparedScene) -> Weather:
+        """As `open`, with a scene that is on its device already; its metric frame is replaced by the stored one."""
+        parts, frame = open_parts(Path(folder), prepared.scene)
+        prepared = replace(prepared, scene=replace(prepared.scene, frame=frame))
+        history, answer = parts.history.to(prepared.device), parts.answer.to(prepared.device)
+        return Weather.untrained(prepared, parts.effect, parts.options, history, answer)
