@@ -63,14 +63,12 @@ def _limit_at_end(level, k, heights, columns, steep, film):
     return max(edge, against), against > edge
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
 def _push(level, queue, queued, head, size):
-    """Append a level to the ring `queue` unless it is in it; returns the new size."""
-    if not queued[level]:
-        queued[level] = True
-        queue[(head + size) % len(queue)] = level
-        size += 1
-    return size
+    """Append a level to the ring `queue`; returns the new size."""
+    queued[level] = True
+    queue[(head + size) % len(queue)] = level
+    return size + 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -136,7 +134,8 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
                     onto = columns.beyond[level, k]
                     if onto >= 0:
                         heights[onto] += give / ends
-                        size = _push(onto, queue, queued, head, size)
+                        if not queued[onto]:
+                            size = _push(onto, queue, queued, head, size)
                     else:
                         lost += give / ends
         else:
@@ -147,7 +146,7 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
             if corner >= 0:
                 heights[corner] += share * give
             for onto in (side, corner):
-                if onto >= 0:
+                if onto >= 0 and not queued[onto]:
                     size = _push(onto, queue, queued, head, size)
         heights[level] = max(heights[level] - give, rested[level])  # the difference may be lower by round-off
         # Levels that this one supported may topple next, and so may the level itself.
@@ -155,7 +154,7 @@ def topple(start, heights, rested, columns, steep, film, slack, most):
         for i in range(max(x - 1, 0), min(x + 2, nx)):
             for j in range(max(y - 1, 0), min(y + 2, ny)):
                 for near in range(first[i * ny + j], first[i * ny + j + 1]):
-                    if heights[near] > film + slack:
+                    if not queued[near] and heights[near] > film + slack:
                         size = _push(near, queue, queued, head, size)
     left = np.empty(size, np.int64)
     for n in range(size):
