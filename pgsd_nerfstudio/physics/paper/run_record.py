@@ -95,7 +95,8 @@ class RunRecord:
             seed: of the orientations.
             about: plain values to keep with the history.
         """
-        nothing, no_rest = np.zeros(0, np.int32), self.ground.rest(np.zeros((0, 3)), np.zeros(0))
+        nothing, no_bits = np.zeros(0, np.int32), np.zeros(0, np.uint8)
+        no_rest = self.ground.rest(np.zeros((0, 3)), np.zeros(0))
         rests = [(nothing, no_rest), *self._rests]
         chunk = Chunk(
             start=0,
@@ -108,10 +109,10 @@ class RunRecord:
             represents=np.ones(self.born, np.float32),
             quats=random_orientations([seed, 0x0417], self.born),
             kind_ids=nothing,
-            kind_bits=np.zeros(0, np.uint8),
+            kind_bits=no_bits,
             ended_ids=np.concatenate([nothing, *(stop.ids for stop in self._stops)]),
             ended_frames=np.concatenate([nothing, *(np.full(len(stop.ids), stop.end, np.int32) for stop in self._stops)]),
-            ended_how=np.concatenate([nothing, *(np.full(len(stop.ids), stop.how, np.int32) for stop in self._stops)]),
+            ended_how=np.concatenate([no_bits, *(np.full(len(stop.ids), stop.how, np.uint8) for stop in self._stops)]),
             rest_ids=np.concatenate([ids for ids, _ in rests]),
             rest_positions=np.concatenate([rest.positions for _, rest in rests]),
             rest_quats=np.concatenate([rest.quats for _, rest in rests]),
