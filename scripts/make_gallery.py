@@ -21,11 +21,11 @@ import tyro
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from pgsd_nerfstudio.weather.video import to_bytes
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.effects.effect import EFFECTS
 from pgsd_nerfstudio.scene.camera_path import choose_views
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.weather.video import to_bytes
 
 TIMES = (0.05, 0.35, 0.65, 0.95)  # of the whole weather, those of the paper's own sheets
 GAP = 4  # pixels between pictures

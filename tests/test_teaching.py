@@ -67,7 +67,7 @@ def lesson():
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * step / STEPS))
             which = step % len(PATHS)
-            rolled = rollout.window(PATHS[which][2], frames, begin="simulation")
+            instants = rollout.window(PATHS[which][2], frames, begin="simulation")
             weather = [scene.frame.gaussians_to_scene(one.gaussians) for one in instants]
             clip = rasterizer.render(paths[which], weather).rgb.permute(0, 3, 1, 2)
             guidance, scale = torch.zeros(()), 1.0
