@@ -1,4 +1,4 @@
-"""LEARNED: the neural dynamics field, rolled out over time from the simulated motion."""
+"""The neural dynamics field: what is learned of motion and look, rolled out over time from the simulated motion."""
 
 from pgsd_nerfstudio.dynamics.deformation import Deformation, DeformationConfig, DeformedCloud, scattered
 from pgsd_nerfstudio.dynamics.drift import Gap, drift, gaps
