@@ -191,9 +191,9 @@ def test_a_run_without_its_answer_names_the_command_too(run: Path, tmp_path: Pat
 def test_a_scene_that_changed_since_is_refused(run: Path, tmp_path: Path):
     copy = copied(run, tmp_path)
     config = yaml.load(copy.read_text(), Loader=yaml.Loader)
-    config.pipeline.options = grouped(config.pipeline.options, {"load_scene": write_scene(tmp_path, table=0.7)})
+    config.pipeline.share(grouped(config.pipeline.options, {"load_scene": write_scene(tmp_path, table=0.7)}))
     copy.write_text(yaml.dump(config))
-    with pytest.raises(RunError, match="is not the scene for which .* was made"):
+    with pytest.raises(RunError, match=r"is not the scene for which .* was made"):
         opened(copy)
 
 
