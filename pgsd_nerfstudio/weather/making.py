@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from pgsd_nerfstudio.effects import Effect, effect
+from pgsd_nerfstudio.effects import Effect
+from pgsd_nerfstudio.effects import effect as effect_named
 from pgsd_nerfstudio.physics.motion_prior import Profile, motion_prior
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.response.answer import Answer
@@ -20,7 +21,7 @@ from pgsd_nerfstudio.weather.weather import Weather
 
 def simulate(
     scene: Scene,
-    weather: Effect | str = "snowfall",
+    effect: Effect | str = "snowfall",
     *,
     seconds: float = 10.0,
     fps: float = 25.0,
@@ -42,7 +43,7 @@ def simulate(
 
     Args:
         scene: as `load_scene` returns it.
-        weather: an effect, or the name of a built-in one: snowfall, rainfall, fog or sandstorm.
+        effect: the weather, or the name of a built-in one: snowfall, rainfall, fog or sandstorm.
         seconds: length of the weather in seconds.
         fps: frames per second of the simulation.
         seed: another seed gives another weather of the same kind.
@@ -69,7 +70,7 @@ def simulate(
         collisions=collisions,
     )
     options.check()
-    chosen = effect(weather) if isinstance(weather, str) else weather
+    chosen = effect_named(effect) if isinstance(effect, str) else effect
     folder = None if edited_images is None else Path(edited_images)
     return make_weather(prepare_scene(scene, device), chosen, options, edited_images=folder, progress=progress)
 
@@ -95,7 +96,7 @@ def make_weather(
         ValueError: the scene cannot hold this weather, or an edited picture cannot be used.
         OSError: the cache cannot be written.
     """
-    surface = surface_of(prepared.scene, prepared.rasterizer)
+    surface = surface_of(prepared.scene, prepared.rasterizer, progress=progress)
     history = motion_of(prepared, surface, effect, options, progress=progress).to(prepared.device)
     answer = answer_to(prepared, surface, effect, options, edited_images=edited_images)
     return Weather.untrained(prepared, effect, options, history, answer)
