@@ -43,7 +43,14 @@ class Stopwatch:
 
 
 def seen_by(prepared: PreparedScene, cameras: Cameras, history: ParticleHistory, start: int) -> Bool[Tensor, " p"]:
-    """Particles that appear in at least one picture of the clip that starts at frame `start`, in the simulated motion."""
+    """Particles that appear in at least one picture of a clip, in the simulated motion.
+
+    Args:
+        prepared: the scene.
+        cameras: of the clip, one a frame, in scene units.
+        history: the simulated motion.
+        start: first frame of the clip.
+    """
     seen = torch.zeros(len(history), dtype=torch.bool, device=history.device)
     stop = start + len(cameras)
     window = history.window(start, stop)
@@ -74,7 +81,15 @@ def render_clip(
     background: Float[Tensor, "3"],
     moments: Sequence[Moment | None],
 ) -> Float[Tensor, "t 3 h w"]:
-    """The clip in 0..1, without a graph."""
+    """The clip in 0..1, without a graph.
+
+    Args:
+        prepared: the scene.
+        cameras: of the clip, one a frame.
+        weather: the particles of each frame, in scene units.
+        background: colour behind the scene.
+        moments: the answer of the scene at each frame; None: as it was trained.
+    """
     with torch.no_grad():
         return prepared.clip_rasterizer.render(cameras, weather, background, moments).rgb.permute(0, 3, 1, 2).clamp(0, 1)
 
@@ -82,12 +97,21 @@ def render_clip(
 def surrogate(
     prepared: PreparedScene,
     cameras: Cameras,
-    weather: Sequence[Gaussians],  # one set a frame, with the graph of the roll-out
+    weather: Sequence[Gaussians],
     background: Float[Tensor, "3"],
     moments: Sequence[Moment | None],
-    gradient: Float[Tensor, "t 3 h w"],  # of the loss with respect to the clip
+    gradient: Float[Tensor, "t 3 h w"],
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians."""
+    """A scalar whose gradient is that of the loss, and the norm of what reached each quantity of the Gaussians.
+
+    Args:
+        prepared: as for `render_clip`.
+        cameras: as for `render_clip`.
+        weather: the particles of each frame, in scene units, with the graph of the roll-out.
+        background: as for `render_clip`.
+        moments: as for `render_clip`.
+        gradient: of the loss with respect to the clip.
+    """
     total = gradient.new_zeros(())
     squares: dict[str, float] = {}
     for k, gaussians in enumerate(weather):

@@ -118,7 +118,13 @@ class TrajectoryDataManager(VanillaDataManager):
 
 
 def partners(views: Cameras, first: int, nearest: int | None) -> Int[Tensor, " n"]:
-    """Views to which a trajectory from view `first` may lead: all others, or the nearest in place and direction."""
+    """Views to which a trajectory may lead: all others, or the nearest in place and direction.
+
+    Args:
+        views: all training views.
+        first: number of the view from which it leads.
+        nearest: how many of the nearest; None: all.
+    """
     c2w = views.opengl()
     away = (c2w[:, :3, 3] - c2w[first, :3, 3]).norm(dim=1)
     turned = (c2w[:, :3, 2] - c2w[first, :3, 2]).norm(dim=1)

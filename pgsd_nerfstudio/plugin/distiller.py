@@ -27,7 +27,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass(frozen=True)
 class Distiller:
-    """An opened video prior that has heard what is wanted."""
+    """An opened video prior with its prompts embedded: it gives clips a gradient."""
 
     prior: VideoPrior
     wanted: str
@@ -41,7 +41,12 @@ class Distiller:
 
     @staticmethod
     def of(prior: VideoPrior, options: RunOptions, description: str) -> Distiller:
-        """A distiller toward the effect's prompt for a scene that is called `description`.
+        """A distiller toward the prompt of the run's effect.
+
+        Args:
+            prior: the opened video prior.
+            options: of the run.
+            description: what prompts call the scene.
 
         Raises:
             RunError: the text encoder cannot be used.
@@ -58,7 +63,11 @@ class Distiller:
         return Distiller(prior, prompts.text, unwanted, embeddings, guidance.distillation, TimestepSchedule(), steps, seed)
 
     def gradient(self, clip: Float[Tensor, "t 3 h w"], step: int) -> DistilledClip:
-        """Which way the clip should change, in training step `step`; the noise depends on the seed and the step only.
+        """Which way a clip should change. The noise depends on the seed and the step only.
+
+        Args:
+            clip: pictures in 0..1.
+            step: number of the training step.
 
         Raises:
             RunError: the prior cannot take clips of this shape.
@@ -75,6 +84,10 @@ class Distiller:
 
 def open_prior(options: RunOptions, device: torch.device | str) -> tuple[VideoPrior, RunOptions]:
     """The video prior of a run, and the options with the size of the training clips settled.
+
+    Args:
+        options: of the run.
+        device: where the prior computes.
 
     Raises:
         RunError: the prior cannot be used, or the weather is shorter than a clip.

@@ -63,7 +63,12 @@ def from_nerfstudio(cameras: NerfstudioCameras) -> Cameras:
 
 
 def to_nerfstudio(cameras: Cameras, times: torch.Tensor | None = None) -> NerfstudioCameras:
-    """The same views as nerfstudio's cameras; times [T] in 0..1."""
+    """The same views as nerfstudio's cameras.
+
+    Args:
+        cameras: t views.
+        times: of each view [t] in 0..1 over the whole weather; None: the views have no time.
+    """
     return NerfstudioCameras(
         camera_to_worlds=cameras.opengl()[:, :3],
         fx=cameras.Ks[:, 0, 0],
