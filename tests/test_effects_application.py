@@ -16,7 +16,6 @@ import torch
 
 from pgsd_nerfstudio.cli.main import run
 from pgsd_nerfstudio.cli.preview import Preview
-from pgsd_nerfstudio.cli.refusal import Refusal
 from pgsd_nerfstudio.effects import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL, Effect, InitialLook, initial_look
 from pgsd_nerfstudio.effects.application import applied, remarks
 from pgsd_nerfstudio.effects.matter import INTENSITIES
@@ -30,6 +29,7 @@ from pgsd_nerfstudio.physics.air.emitters import Sizes
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.laws import fall_speeds
 from pgsd_nerfstudio.physics.laws.populations import extinction, fall_speed, integral, number_density
+from pgsd_nerfstudio.refusal import Refusal
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.options import SceneOptions
 

@@ -237,7 +237,7 @@ def test_bad_emission_and_grids_are_refused():
         Mpm(MpmConfig(dx=0.05), Domain((0, 0, 0), (1e4, 1e4, 1e4)))
     with pytest.raises(ValueError, match="dx must be positive"):
         MpmConfig(dx=-1.0)
-    with pytest.raises(ValueError, match=r"must be faster than what may fall asleep, got 0.01 and 0.02 m/s"):
+    with pytest.raises(ValueError, match=r"the wake speed must exceed the speed of falling asleep, got 0.01 and 0.02 m/s"):
         Sleep(wake_speed=0.01)
     with pytest.raises(ValueError, match="grows by a finite length of 0 or more, got -1 m"):
         FLOOR.grown(-1.0)

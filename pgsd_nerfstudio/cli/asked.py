@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 from pgsd_nerfstudio.cli.console import say
-from pgsd_nerfstudio.cli.refusal import refusing
 from pgsd_nerfstudio.effects.options import EffectOptions
+from pgsd_nerfstudio.refusal import refusing
 from pgsd_nerfstudio.weather.options import FLAT, SceneOptions, SimulationOptions
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ import tyro
 
 from pgsd_nerfstudio.cli.bench import Bench
 from pgsd_nerfstudio.cli.preview import Preview
-from pgsd_nerfstudio.cli.refusal import Refusal
 from pgsd_nerfstudio.cli.simulate import Simulate
 from pgsd_nerfstudio.cli.verify import Verify
+from pgsd_nerfstudio.refusal import Refusal
 
 Command = (
     Annotated[Preview, tyro.conf.subcommand("preview")]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
 from pgsd_nerfstudio.cli.console import console, say
-from pgsd_nerfstudio.cli.refusal import Refusal, refusing
+from pgsd_nerfstudio.refusal import Refusal, refusing
 from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions, SimulationOptions
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
-from pgsd_nerfstudio.cli.refusal import refusing
+from pgsd_nerfstudio.refusal import refusing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
