@@ -1,8 +1,7 @@
 """Numbers instead of pictures: where the particles are, and what the weather weighs.
 
 Everything is in metres of the metric frame (z up, ground at z = 0), kilograms and seconds. A simulated particle stands for
-several real ones (`history.represents`); masses are those of the real ones. The weather is that of the first example: where
-that was run, its motion comes from the cache.
+several real ones (`history.represents`); masses are those of the real ones.
 
 Writes positions.csv, the places of all particles at second 3; report.json, particles, mass, momentum and energy by frame; and
 a folder, from which `Weather.open` makes the same weather again, on any machine that has the scene.

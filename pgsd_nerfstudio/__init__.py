@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.scene.scene import Scene, SceneError
     from pgsd_nerfstudio.weather.making import simulate
     from pgsd_nerfstudio.weather.picture import Picture
+    from pgsd_nerfstudio.weather.stored import StoredWeatherError
     from pgsd_nerfstudio.weather.video import write_video
     from pgsd_nerfstudio.weather.weather import Weather
 
@@ -36,6 +37,7 @@ __all__ = [
     "Picture",
     "Scene",
     "SceneError",
+    "StoredWeatherError",
     "Weather",
     "__version__",
     "effect",
@@ -52,6 +54,7 @@ _PLACES = {
     "Picture": "weather.picture",
     "Scene": "scene.scene",
     "SceneError": "scene.scene",
+    "StoredWeatherError": "weather.stored",
     "Weather": "weather.weather",
     "effect": "effects",  # the whole room: its modules register the built-in effects
     "load_scene": "scene.loading",

@@ -60,6 +60,7 @@ def test_the_same_preview_twice_is_the_same_picture(yard, tmp_path):
         ({"width": 8}, "at least 16x16 pixels, got 8x64"),
         ({"output": "v.avi"}, "--output must end in .mp4, got v.avi"),
         ({"start": -1}, "--start must not be negative, got -1 s"),
+        ({"start": 0.9}, "4 frames from --start 0.9 s go beyond the end of the weather at 1 s"),
         ({"intensity": -2}, "intensity must lie in"),
         ({"max-particles": 0}, "--max-particles must be positive, got 0"),
         ({"views": (0, 8)}, "views must lie in 0-7"),
@@ -73,6 +74,13 @@ def test_bad_input_gets_one_sentence_and_exit_code_1(yard, tmp_path, capsys, mon
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pgsd: ")]
     assert len(said) == 1 and sentence in said[0]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_is_no_longer_than_its_weather(yard, tmp_path, capsys):
+    """A longer one would be another weather, and its motion another one than that of the other commands."""
+    assert preview(yard, tmp_path / "v.mp4", frames=50, seconds=0.2, **{"max-particles": 50}) == 0
+    assert "the weather has 5 frames: the video shows all of them, not 50" in capsys.readouterr().err
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "v.mp4"))[0] == 5
 
 
 def test_a_splat_that_is_none_is_named(yard, tmp_path, capsys):

@@ -120,7 +120,8 @@ def test_a_stored_weather_comes_back_to_the_bit(scene, weather, tmp_path: Path):
     [
         (lambda folder: (folder / "motion_prior.safetensors").unlink(), "the motion prior .* is missing or damaged"),
         (lambda folder: (folder / "answer.safetensors").write_bytes(b"no"), "the scene's answer .* is missing or damaged"),
-        (lambda folder: (folder / "weather.json").write_text("{}"), "the description .* is missing or damaged"),
+        (lambda folder: (folder / "weather.json").unlink(), "no weather was stored in .*: it holds none"),
+        (lambda folder: (folder / "weather.json").write_text("{}"), "the description .* is damaged"),
         (lambda folder: _older(folder / "weather.json"), r"was written by pgsd_nerfstudio 0\.0\.9, installed is"),
     ],
 )
@@ -141,6 +142,32 @@ def test_a_stored_weather_of_another_scene_is_refused(weather, tmp_path: Path):
         pgsd_nerfstudio.Weather.open(weather.save(tmp_path / "kept"), pgsd_nerfstudio.load_scene(other, data=tmp_path))
 
 
+@pytest.mark.parametrize("device", ["tpu", "cuda", "mps"])
+def test_a_device_that_is_not_there_is_said(scene, device):
+    if device == "cuda" and torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(ValueError, match=f"a scene is prepared on cpu or cuda, got '?{device}"):
+        pgsd_nerfstudio.simulate(scene, device=device)
+
+
+def test_words_become_weather(scene):
+    purple = pgsd_nerfstudio.EffectOptions(weather="purple snow")
+    made = pgsd_nerfstudio.simulate(scene, purple, seconds=0.2, max_particles=50, progress=False)
+    assert made.effect == purple.resolve()[0] and repr(made).startswith("Weather(snowfall in floor, 0.2 s, ")
+
+
+def test_pictures_are_png_in_the_folder_that_is_meant(scene, weather, tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    picture = weather.render(scene.cameras[0], second=0.5)
+    assert picture.save("~/a.png") == tmp_path / "a.png" and (tmp_path / "a.png").is_file()
+    assert weather.save("~/kept") == tmp_path / "kept"
+    assert weather.save_video("~/a.mp4", scene.cameras[[0, 1]].resized(48, 32)) == tmp_path / "a.mp4"
+    with pytest.raises(ValueError, match=r"a picture is written as \.png, got .*a\.jpg"):
+        picture.save(tmp_path / "a.jpg")
+    with pytest.raises(NotADirectoryError, match=r"a weather is stored in a folder, but .*a\.png is a file"):
+        weather.save(tmp_path / "a.png")
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -149,9 +176,14 @@ def test_a_stored_weather_of_another_scene_is_refused(weather, tmp_path: Path):
         ({"fps": float("nan")}, "--fps must be positive, got nan"),
         ({"max_particles": 0}, "--max-particles must be positive, got 0"),
         ({"seconds": 3000, "fps": 1000}, "are 3,000,000 frames; at most 200,000 can be simulated"),
-        ({"seed": -1}, "--seed must not be negative, got -1"),
+        ({"seed": -1}, "--seed must not be negative"),
+        ({"seed": 2**70}, "less than 2.63, got"),
+        ({"physics": "newton"}, "--physics must be metric or paper, got 'newton'"),
+        ({"collisions": "False"}, "--collisions must be True or False, got 'False'"),
+        ({"max_particles": 1.5}, "--max-particles must be a whole number, got 1.5"),
     ],
 )
+@pytest.mark.mistyped
 def test_one_judge_of_simulation_options(options, sentence):
     with pytest.raises(ValueError, match=sentence):
         SimulationOptions(**options).check()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
 from pgsd_nerfstudio.cli.console import console, say
 from pgsd_nerfstudio.refusal import Refusal, refusing
-from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions, SimulationOptions
+from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,7 +24,7 @@ class Preview(WeatherCommand):
     output: Path = Path("preview.mp4")
     """Where the video goes; its last frame goes beside it as .png."""
     frames: int = 50
-    """Length of the video in frames."""
+    """Length of the video in frames; a weather that has fewer is shown as a whole."""
     width: int = 640
     """Width in pixels."""
     height: int = 360
@@ -47,25 +47,25 @@ class Preview(WeatherCommand):
         effect = self.chosen_effect()
         scene = self.open_scene()
         with refusing(ValueError):
-            path = slow_path(scene, frames=self.frames, fps=self.simulation.fps, start=self._first, views=self.views)
+            path = slow_path(scene, frames=self._shown, fps=self.simulation.fps, start=self._first, views=self.views)
         self._make_folder()
         with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
-            weather = make_weather(prepare_scene(scene), effect, self._simulated, edited_images=self.answer.edited_images)
+            weather = make_weather(prepare_scene(scene), effect, self.simulation, edited_images=self.answer.edited_images)
         cameras = path.resized(self.width, self.height)
 
         def picture(index: int) -> Tensor:
             return weather.render_frame(cameras[index], self._first + index).rgb
 
-        shown = track(range(self.frames), "rendering", console=console(), transient=True)
+        shown = track(range(self._shown), "rendering", console=console(), transient=True)
         poster = self.output.with_suffix(".png")
         try:
             write_video(self.output, (picture(index) for index in shown), self.simulation.fps)
-            write_picture(poster, picture(self.frames - 1))
+            write_picture(poster, picture(self._shown - 1))
         except OSError as error:
             raise Refusal(
                 f"{self.output} could not be written ({error}): free some space or choose another --output"
             ) from error
-        say(f"{self.frames} frames in {time.perf_counter() - began:.0f} s")
+        say(f"{self._shown} frames in {time.perf_counter() - began:.0f} s")
         print(self.output, poster, sep="\n")
         return 0
 
@@ -82,6 +82,15 @@ class Preview(WeatherCommand):
             raise Refusal(f"--start must not be negative, got {self.start:g} s")
         with refusing(ValueError):
             self.answer.check()
+            self.simulation.check()
+        simulation = self.simulation
+        if self._first + self._shown > simulation.frames:
+            raise Refusal(
+                f"{self._shown} frames from --start {self.start:g} s go beyond the end of the weather at "
+                f"{simulation.seconds:g} s: use more --seconds or fewer --frames"
+            )
+        if self._shown < self.frames:
+            say(f"the weather has {simulation.frames} frames: the video shows all of them, not {self.frames}")
 
     def _make_folder(self) -> None:
         """The folder of the output, before anything costly is done."""
@@ -91,16 +100,13 @@ class Preview(WeatherCommand):
             raise Refusal(f"{self.output} cannot be written ({error.strerror}); choose another --output") from error
 
     @property
+    def _shown(self) -> int:
+        """Frames of the video: as many as asked for and as the weather has."""
+        return min(self.frames, self.simulation.frames)
+
+    @property
     def _first(self) -> int:
         """The first frame of the weather that is shown."""
         if self.start is not None:
             return round(self.start * self.simulation.fps)
-        return max(0, round(self.simulation.seconds * self.simulation.fps) - self.frames)
-
-    @property
-    def _simulated(self) -> SimulationOptions:
-        """The weather as asked for, or longer where the video goes on after its end."""
-        last = self._first + self.frames
-        if last <= self.simulation.frames:
-            return self.simulation
-        return replace(self.simulation, seconds=last / self.simulation.fps)
+        return self.simulation.frames - self._shown

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
-from pgsd_nerfstudio.refusal import refusing
+from pgsd_nerfstudio.refusal import Refusal, refusing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,8 +31,10 @@ class Simulate(WeatherCommand):
         from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
 
         effect = self.chosen_effect()
-        with refusing(OSError):
+        try:
             self.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise Refusal(f"{self.output} cannot be a folder ({error.strerror}); choose another --output") from error
         began = time.perf_counter()
         scene = self.open_scene()
         with refusing(ValueError, OSError):

@@ -52,9 +52,11 @@ def slow_path(scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, v
         views: numbers of the views that the path leads from and to; by default `choose_views`.
 
     Raises:
-        ValueError: there is no such view.
+        ValueError: there is no such view, or a number is out of its range.
     """
     cameras = scene.cameras
+    if frames < 1 or start < 0 or not 0 < fps < float("inf"):
+        raise ValueError(f"a path has frames >= 1, start >= 0 and fps > 0, got {frames}, {start} and {fps:g}")
     first, last = views or choose_views(cameras, scene.frame)
     if not (0 <= first < len(cameras) and 0 <= last < len(cameras)):
         raise ValueError(f"views must lie in 0-{len(cameras) - 1}, the training views of this scene, got {first} {last}")

@@ -63,7 +63,13 @@ class Cameras:
         return Cameras(self.viewmats.to(device), self.Ks.to(device), self.width, self.height)
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same views in another image size in pixels; what does not fit the new shape is cropped, never stretched."""
+        """The same views in another image size in pixels; what does not fit the new shape is cropped, never stretched.
+
+        Raises:
+            ValueError: a side has no pixel.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"a picture has at least 1x1 pixels, got {width}x{height}")
         zoom = max(width / self.width, height / self.height)
         Ks = self.Ks.clone()
         Ks[:, 0, 0] *= zoom

@@ -82,6 +82,11 @@ def _checkpoint(path: Path) -> tuple[Path, Path]:
     run = path.resolve() if path.is_dir() else path.resolve().parent
     if path.is_file() and path.name != "config.yml":
         raise SceneError(f"{path} is no scene: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
+    if run.parent.name == "pgsd-weather":
+        raise SceneError(
+            f"{path} is a run of pgsd-weather, which holds a weather and no scene: ns-viewer and ns-render show it; "
+            "for another weather pass the scene that it was trained on"
+        )
     checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
     if not checkpoints:
         raise SceneError(f"{run} is no trained run: expected nerfstudio_models/step-*.ckpt in it, found none")

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from rich.console import Console
 
 from pgsd_nerfstudio.effects import Effect
 from pgsd_nerfstudio.effects import effect as effect_named
+from pgsd_nerfstudio.effects.options import EffectOptions
 from pgsd_nerfstudio.physics.motion_prior import Profile, motion_prior
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.response.answer import Answer
@@ -18,10 +20,12 @@ from pgsd_nerfstudio.weather.options import SimulationOptions
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
 from pgsd_nerfstudio.weather.weather import Weather
 
+console = Console(stderr=True, highlight=False)
+
 
 def simulate(
     scene: Scene,
-    effect: Effect | str = "snowfall",
+    effect: Effect | EffectOptions | str = "snowfall",
     *,
     seconds: float = 10.0,
     fps: float = 25.0,
@@ -43,7 +47,8 @@ def simulate(
 
     Args:
         scene: as `load_scene` returns it.
-        effect: the weather, or the name of a built-in one: snowfall, rainfall, fog or sandstorm.
+        effect: the weather; or options of one, such as EffectOptions(weather="purple snow"); or the name of a built-in one:
+            snowfall, rainfall, fog or sandstorm.
         seconds: length of the weather in seconds.
         fps: frames per second of the simulation.
         seed: another seed gives another weather of the same kind.
@@ -70,6 +75,10 @@ def simulate(
         collisions=collisions,
     )
     options.check()
+    if isinstance(effect, EffectOptions):
+        effect, remarks = effect.resolve()
+        for remark in remarks if progress else ():
+            console.print(remark, style="dim", markup=False)
     chosen = effect_named(effect) if isinstance(effect, str) else effect
     folder = None if edited_images is None else Path(edited_images)
     return make_weather(prepare_scene(scene, device), chosen, options, edited_images=folder, progress=progress)

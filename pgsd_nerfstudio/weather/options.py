@@ -62,8 +62,8 @@ class SimulationOptions:
     fps: float = 25.0
     """Frames per second of the simulation and of what is shown of it; 25 as in the paper's videos."""
     max_particles: int | None = None
-    """Most active particles at once, each standing for several real ones: bounds time and memory. By default 20,000.
-    With CUDA 100,000."""
+    """Most active particles at once, each standing for several real ones: bounds time and memory. Droplets of splashes come on
+    top; --physics paper has its own number. By default 20,000, with CUDA 100,000."""
     physics: Literal["metric", "paper"] = "metric"
     """metric is right in SI units; paper is the publication's solver and numbers (MPM throughout in a unit cube, no air),
     to compare with."""
@@ -93,8 +93,17 @@ class SimulationOptions:
                 f"--seconds {self.seconds:g} at --fps {self.fps:g} are {self.seconds * self.fps:,.0f} frames; at most "
                 f"{MOST_FRAMES:,} can be simulated"
             )
-        if self.seed < 0:
-            raise ValueError(f"--seed must not be negative, got {self.seed}")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"--seed must not be negative and less than 2^63, got {self.seed}")
+        if self.physics not in ("metric", "paper"):
+            raise ValueError(f"--physics must be metric or paper, got {self.physics!r}")
+        for name in ("everything", "collisions"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"--{name} must be True or False, got {getattr(self, name)!r}")
+        for name in ("max_particles", "seed"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, int):
+                raise ValueError(f"--{name.replace('_', '-')} must be a whole number, got {value!r}")
 
     @property
     def frames(self) -> int:

@@ -31,10 +31,18 @@ class Picture(NamedTuple):
         """Write the colours as PNG, clipped to 8 bits; returns the path.
 
         Raises:
+            ValueError: the path does not end in .png.
             OSError: it could not be written; nothing is left behind.
         """
-        write_picture(Path(path), self.rgb)
-        return Path(path)
+        path = Path(path).expanduser()
+        if path.suffix.lower() != ".png":
+            raise ValueError(f"a picture is written as .png, got {path}")
+        write_picture(path, self.rgb)
+        return path
+
+    def __repr__(self) -> str:
+        height, width, _ = self.rgb.shape
+        return f"Picture({width}x{height})"
 
 
 def picture_of(prepared: PreparedScene, camera: Cameras, weather: Gaussians | None, moment: Moment | None) -> Picture:

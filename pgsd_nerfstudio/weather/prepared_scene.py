@@ -32,9 +32,15 @@ def prepare_scene(scene: Scene, device: torch.device | str | None = None, layers
         layers: press the frozen scene behind every 16x16 pixels of a training clip into so many layers (CPU only); None: exact.
 
     Raises:
-        ValueError: there is no rasterizer for the device, or layers are asked of another than the CPU's.
+        ValueError: the device is neither cpu nor cuda or is not there, or layers are asked of another than the CPU's.
     """
-    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    try:
+        device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    except RuntimeError as error:
+        raise ValueError(f"a scene is prepared on cpu or cuda, got {device!r}") from error
+    if device.type not in ("cpu", "cuda") or (device.type == "cuda" and not torch.cuda.is_available()):
+        found = "CUDA is there" if torch.cuda.is_available() else "there is no CUDA device here"
+        raise ValueError(f"a scene is prepared on cpu or cuda, got {device}; {found}")
     frozen = scene.gaussians.to(device)
     exact = choose_rasterizer(frozen, device)
     return PreparedScene(scene, exact, exact if layers is None else choose_rasterizer(frozen, device, layers), device)

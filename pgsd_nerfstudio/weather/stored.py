@@ -51,6 +51,8 @@ def save_parts(folder: Path, scene: Scene, parts: StoredWeather) -> None:
     Raises:
         OSError: a file could not be written.
     """
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"a weather is stored in a folder, but {folder} is a file")
     made_for = {"splat": _splat_key(scene), "frame": _plain(scene.frame)}
     folder.mkdir(parents=True, exist_ok=True)
     replace(parts.history, about={**parts.history.about, **made_for}).save(folder / MOTION_FILE)
@@ -70,6 +72,9 @@ def open_parts(folder: Path, scene: Scene) -> tuple[StoredWeather, Frame]:
     Raises:
         StoredWeatherError: a file is missing, damaged or of another version, or the scene is another one.
     """
+    if not (folder / DESCRIPTION_FILE).is_file():
+        found = "holds none" if folder.is_dir() else "is no folder"
+        raise StoredWeatherError(f"no weather was stored in {folder}: it {found}; Weather.save and ns-train store one")
     effect, options = _description(folder / DESCRIPTION_FILE)
     motion = folder / MOTION_FILE
     history = ParticleHistory.load(motion)
@@ -98,7 +103,7 @@ def _description(path: Path) -> tuple[Effect, SimulationOptions]:
         effect = TypeAdapter(Effect).validate_python(stored["effect"])
         options = TypeAdapter(SimulationOptions).validate_python(stored["options"])
     except (OSError, ValidationError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise StoredWeatherError(f"the description {path} of the weather is missing or damaged") from error
+        raise StoredWeatherError(f"the description {path} of the weather is damaged") from error
     return effect, options
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import tempfile
 import uuid
@@ -31,16 +32,18 @@ def write_picture(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
         Image.fromarray(to_bytes(picture)).save(unfinished)
 
 
-def write_video(path: Path, frames: Iterable[Float[Tensor, "h w 3"]], fps: float) -> int:
+def write_video(path: str | Path, frames: Iterable[Float[Tensor, "h w 3"]], fps: float) -> int:
     """Write frames as they come as an H.264 mp4; returns how many.
 
     H.264 wants even sizes: odd ones lose their last row or column.
 
     Raises:
-        ValueError: there are no frames.
+        ValueError: there are no frames, or the frames per second are not a positive number.
         OSError: it could not be written; nothing is left behind.
     """
-    count = 0
+    count, path = 0, Path(path).expanduser()
+    if not 0 < fps < math.inf:
+        raise ValueError(f"a video needs a positive number of frames per second, got {fps:g}")
     with _beside(path) as unfinished, ExitStack() as stack:
         send: Callable[[bytes], object] | None = None
         for frame in frames:

@@ -24,9 +24,10 @@ from pgsd_nerfstudio.weather.options import SimulationOptions
 from pgsd_nerfstudio.weather.picture import Picture, picture_of
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
 from pgsd_nerfstudio.weather.stored import StoredWeather, open_parts, save_parts
+from pgsd_nerfstudio.weather.video import write_video
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Weather:
     """One weather in one scene. Frame f shows the second f / fps; seconds count from the beginning of the weather."""
 
@@ -58,6 +59,10 @@ class Weather:
         look = in_place(look, history, answer, scene.frame.to_metric(scene.gaussians.means))
         sequence = Rollout(history, look, DynamicsField.for_history(history), exposure=effect.appearance.exposure)
         return Weather(prepared, effect, options, history, answer, sequence)
+
+    def __repr__(self) -> str:
+        what = f"{self.effect.name} in {self.scene.name}, {self.frame_count / self.fps:g} s"
+        return f"Weather({what}, {len(self.history):,} particles)"
 
     @property
     def scene(self) -> Scene:
@@ -153,6 +158,21 @@ class Weather:
             )
         return (self.render_frame(cameras[k], first + k) for k in range(len(cameras)))
 
+    def save_video(self, path: str | Path, cameras: Cameras, start: float = 0.0) -> Path:
+        """Write the pictures along a camera path as an H.264 mp4; returns its path.
+
+        Args:
+            path: of the video.
+            cameras: as for `frames`.
+            start: as for `frames`.
+
+        Raises:
+            ValueError: the camera path leaves the weather.
+            OSError: it could not be written; nothing is left behind.
+        """
+        write_video(path, (picture.rgb for picture in self.frames(cameras, start)), self.fps)
+        return Path(path).expanduser()
+
     def report(self) -> dict[str, object]:
         """Counts, masses, momentum and energy by frame, as plain values for JSON; see physics.record.report."""
         return report(self.history, self.effect.material)
@@ -172,7 +192,7 @@ class Weather:
         Raises:
             OSError: it could not be written.
         """
-        folder = Path(folder)
+        folder = Path(folder).expanduser()
         save_parts(folder, self.scene, StoredWeather(self.effect, self.options, self.history, self.answer))
         return folder
 
@@ -193,7 +213,7 @@ class Weather:
     @staticmethod
     def open_prepared(folder: str | Path, prepared: PreparedScene) -> Weather:
         """As `open`, with a scene that is on its device already; its metric frame is replaced by the stored one."""
-        parts, frame = open_parts(Path(folder), prepared.scene)
+        parts, frame = open_parts(Path(folder).expanduser(), prepared.scene)
         prepared = replace(prepared, scene=replace(prepared.scene, frame=frame))
         history, answer = parts.history.to(prepared.device), parts.answer.to(prepared.device)
         return Weather.untrained(prepared, parts.effect, parts.options, history, answer)
