@@ -161,7 +161,7 @@ def test_pictures_are_png_in_the_folder_that_is_meant(scene, weather, tmp_path: 
     picture = weather.render(scene.cameras[0], second=0.5)
     assert picture.save("~/a.png") == tmp_path / "a.png" and (tmp_path / "a.png").is_file()
     assert weather.save("~/kept") == tmp_path / "kept"
-    assert weather.save_video("~/a.mp4", scene.cameras[[0, 1]].resized(48, 32)) == tmp_path / "a.mp4"
+    assert weather.save_video("~/a.mp4", scene.cameras[:2].resized(48, 32)) == tmp_path / "a.mp4"
     with pytest.raises(ValueError, match=r"a picture is written as \.png, got .*a\.jpg"):
         picture.save(tmp_path / "a.jpg")
     with pytest.raises(NotADirectoryError, match=r"a weather is stored in a folder, but .*a\.png is a file"):
