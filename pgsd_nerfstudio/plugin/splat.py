@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-SH_C0 = 0.28209479177387814  # the constant basis function of the spherical harmonics
 REST = 15  # coefficients of degree 1 to 3
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pgsd_nerfstudio.scene.courtyard.surfels import Array, Part, Patch, join, noise, samples
+from pgsd_nerfstudio.scene.courtyard.surfels import Array, Part, Patch, join, samples
+from pgsd_nerfstudio.scene.courtyard.texture import noise
 
 if TYPE_CHECKING:
     import open3d as o3d

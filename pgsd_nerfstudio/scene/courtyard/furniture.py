@@ -22,12 +22,11 @@ from pgsd_nerfstudio.scene.courtyard.surfels import (
     cells,
     join,
     lathe,
-    noise,
     samples,
     smooth,
     tube,
-    vary,
 )
+from pgsd_nerfstudio.scene.courtyard.texture import noise, vary
 
 TABLE_HEIGHT = 0.75
 TABLE_RADIUS = 0.64

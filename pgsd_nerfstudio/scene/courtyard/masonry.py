@@ -11,20 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pgsd_nerfstudio.scene.courtyard.surfels import (
-    FILL,
-    Array,
-    Part,
-    Patch,
-    box,
-    cells,
-    join,
-    lathe,
-    noise,
-    rectangle,
-    samples,
-    vary,
-)
+from pgsd_nerfstudio.scene.courtyard.surfels import FILL, Array, Part, Patch, box, cells, join, lathe, rectangle, samples
+from pgsd_nerfstudio.scene.courtyard.texture import noise, vary
 
 HALF = 5.6  # the courtyard reaches from -HALF to HALF in x and y
 TERRACE = 3.3  # radius

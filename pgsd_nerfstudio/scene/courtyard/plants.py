@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from pgsd_nerfstudio.scene.courtyard.masonry import HALF, LAWN_LEVEL, TERRACE, WALL_HEIGHT
-from pgsd_nerfstudio.scene.courtyard.surfels import Array, Part, Patch, box, cards, join, noise, rectangle, samples, tube, vary
+from pgsd_nerfstudio.scene.courtyard.surfels import Array, Part, Patch, box, cards, join, rectangle, samples, tube
+from pgsd_nerfstudio.scene.courtyard.texture import noise, vary
 
 GRASS = np.array([0.075, 0.115, 0.028])
 HEDGE = np.array([0.06, 0.098, 0.036])
