@@ -79,7 +79,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
         OSError: the folder could not be made, or the file could not be renamed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")  # with the suffix by which writers choose a format
     try:
         yield temporary
         temporary.replace(path)

@@ -6,7 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pgsd_nerfstudio.weather.video import _beside, _encoder, to_bytes, write_picture, write_video
+from pgsd_nerfstudio.storage import atomic_write
+from pgsd_nerfstudio.weather.video import _encoder, to_bytes, write_picture, write_video
 
 
 def test_a_video_holds_the_frames_it_was_given(tmp_path):
@@ -34,7 +35,7 @@ def test_a_video_that_fails_halfway_leaves_the_old_one_and_nothing_else(tmp_path
 
 
 def test_an_unfinished_file_is_removed(tmp_path):
-    with pytest.raises(RuntimeError), _beside(tmp_path / "v.mp4") as unfinished:
+    with pytest.raises(RuntimeError), atomic_write(tmp_path / "v.mp4") as unfinished:
         unfinished.write_bytes(b"half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []

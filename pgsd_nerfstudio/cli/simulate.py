@@ -26,6 +26,7 @@ class Simulate(WeatherCommand):
 
     def run(self) -> int:
         from pgsd_nerfstudio.physics.record.report import report
+        from pgsd_nerfstudio.storage import atomic_write
         from pgsd_nerfstudio.surface.mesh import surface_of
         from pgsd_nerfstudio.weather.making import motion_of
         from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
@@ -48,13 +49,10 @@ class Simulate(WeatherCommand):
             1 if sys.platform == "darwin" else 1024
         )
         paths = self.output / "report.json", self.output / "report.png"
-        with refusing(OSError):
-            # Beside first and then renamed, so that no file is ever half a report.
-            beside = [path.with_name(f".{path.name}") for path in paths]
-            beside[0].write_text(json.dumps(found, indent=1) + "\n")
-            draw(found).savefig(beside[1], dpi=110, format="png")
-            for written, path in zip(beside, paths, strict=True):
-                written.replace(path)
+        # Both take their names when both are whole.
+        with refusing(OSError), atomic_write(paths[0]) as text, atomic_write(paths[1]) as plots:
+            text.write_text(json.dumps(found, indent=1) + "\n")
+            draw(found).savefig(plots, dpi=110, format="png")
         print(*paths, sep="\n")
         return 0
 

@@ -97,7 +97,7 @@ class WeatherModel(SplatfactoModel):
 
     def _sequence(self) -> tuple[torch.nn.Module, GaussianSequence]:
         """What is learned of motion and appearance, and the sequence that shows it."""
-        options, history, look = self.config.options.motion, self.history, self.made.sequence.look
+        options, history, look = self.config.options.motion, self.history, self.made.look
         if options.motion == "deformation":
             box = torch.tensor(history.about["domain"]).reshape(2, 3).to(history.device)
             deformation = Deformation(box, history.frames).to(history.device)

@@ -84,4 +84,4 @@ def _without_simulation(weather: Weather) -> Weather:
     domain = torch.tensor(history.about["domain"]).reshape(2, 3)
     count = int(((history.births <= 0) & (history.ends > 0)).sum()) or len(history)
     spread = replace(scattered(domain, history, count, seed=weather.options.seed), about=history.about)
-    return Weather.untrained(weather.prepared, weather.effect, weather.options, spread, weather.answer)
+    return replace(weather, history=spread)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import torch
 from jaxtyping import UInt8
@@ -13,7 +11,7 @@ from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
-from pgsd_nerfstudio.storage import cache_dir
+from pgsd_nerfstudio.storage import atomic_write, cache_dir
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 
@@ -33,10 +31,8 @@ class Views(InputDataset):
         size = (self.prepared.scene.cameras.width, self.prepared.scene.cameras.height)
         if not path.is_file():
             picture = Image.fromarray(self._render(self.indices[image_idx]))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            beside = path.with_name(f".{os.getpid()}.{path.name}")
-            picture.save(beside)
-            beside.replace(path)
+            with atomic_write(path) as beside:
+                picture.save(beside)
         else:
             picture = Image.open(path).convert("RGB")
         return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS))

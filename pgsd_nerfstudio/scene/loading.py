@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import entry_points
@@ -43,15 +44,10 @@ def load_scene(
     Raises:
         SceneError: the input cannot be used; the sentence says why and what to do.
     """
-    if metres_per_unit is not None and not metres_per_unit > 0:
-        raise SceneError(f"metres per scene unit must be a positive number, got {metres_per_unit}")
+    check_source(path, data, metres_per_unit)
     if str(path) == "demo":
         return _demo(metres_per_unit, description)
     path, data = Path(path).expanduser(), None if data is None else Path(data).expanduser()
-    if not path.exists():
-        raise SceneError(f"no scene at {path}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
-    if data is not None and not data.exists():
-        raise SceneError(f"no data at {data}: expected nerfstudio's transforms.json or its folder")
     if path.suffix.lower() == ".ply":
         gaussians = read_ply(path)
         cameras, images = _ply_cameras(path, data, run_cameras)
@@ -63,6 +59,20 @@ def load_scene(
         name = run.parent.parent.name if run.parent.name == "splatfacto" else run.name
     frame = estimate_frame(cameras, gaussians, metres_per_unit)
     return Scene(name or "scene", gaussians, cameras, frame, images, description or _described(name))
+
+
+def check_source(path: str | Path, data: str | Path | None, metres_per_unit: float | None) -> None:
+    """Refuse what `load_scene` can refuse without opening anything; its arguments have the same names.
+
+    Raises:
+        SceneError: there is no such scene or data, or the scale is not a positive number.
+    """
+    if metres_per_unit is not None and not 0 < metres_per_unit < math.inf:
+        raise SceneError(f"metres per scene unit must be a positive number, got {metres_per_unit:g}")
+    if str(path) != "demo" and not Path(path).expanduser().exists():
+        raise SceneError(f"no scene at {path}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
+    if data is not None and not Path(data).expanduser().exists():
+        raise SceneError(f"no data at {data}: expected nerfstudio's transforms.json or its folder")
 
 
 def _demo(metres_per_unit: float | None, description: str | None) -> Scene:

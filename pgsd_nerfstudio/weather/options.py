@@ -43,14 +43,9 @@ class SceneOptions:
         Raises:
             ValueError: there is no such scene or data, or the scale is not a positive number.
         """
-        if str(self.load_scene) != "demo" and not self.load_scene.expanduser().exists():
-            raise ValueError(
-                f"no scene at {self.load_scene}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo"
-            )
-        if self.data is not None and not self.data.expanduser().exists():
-            raise ValueError(f"no data at {self.data}: expected nerfstudio's transforms.json or its folder")
-        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < math.inf:
-            raise ValueError(f"metres per scene unit must be a positive number, got {self.metres_per_unit:g}")
+        from pgsd_nerfstudio.scene.loading import check_source
+
+        check_source(self.load_scene, self.data, self.metres_per_unit)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import subprocess
 import tempfile
-import uuid
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -15,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
+
+from pgsd_nerfstudio.storage import atomic_write
 
 
 def to_bytes(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -28,7 +29,7 @@ def write_picture(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
     Raises:
         OSError: it could not be written; nothing is left behind.
     """
-    with _beside(path) as unfinished:
+    with atomic_write(path) as unfinished:
         Image.fromarray(to_bytes(picture)).save(unfinished)
 
 
@@ -44,7 +45,7 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "h w 3"]], fps:
     count, path = 0, Path(path).expanduser()
     if not 0 < fps < math.inf:
         raise ValueError(f"a video needs a positive number of frames per second, got {fps:g}")
-    with _beside(path) as unfinished, ExitStack() as stack:
+    with atomic_write(path) as unfinished, ExitStack() as stack:
         send: Callable[[bytes], object] | None = None
         for frame in frames:
             even = to_bytes(frame)[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
@@ -85,15 +86,3 @@ def _encoder(path: Path, width: int, height: int, fps: float) -> Iterator[Callab
             said.seek(0)
             lines = said.read().decode(errors="replace").strip().splitlines()
             raise OSError(lines[-1] if lines else f"ffmpeg ended with status {ffmpeg.wait()}")
-
-
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A path in the same folder to write to; takes the final name only if the block succeeds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{uuid.uuid4().hex[:8]}.{path.name}")
-    try:
-        yield unfinished
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
-from pgsd_nerfstudio.effects import Effect, initial_look
+from pgsd_nerfstudio.effects import Effect, InitialLook, initial_look
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.response.answer import Answer, Shown
@@ -38,27 +39,23 @@ class Weather:
     """The simulated motion, in metres of the metric frame (z up, ground at z = 0)."""
     answer: Answer
     """How the frozen scene looks under the weather."""
-    sequence: GaussianSequence
-    """What is shown of the motion: as simulated, or with what training has learned."""
+    trained: GaussianSequence | None = None
+    """What training has learned to show; None: the motion as simulated, with the initial look."""
 
-    @staticmethod
-    def untrained(
-        prepared: PreparedScene, effect: Effect, options: SimulationOptions, history: ParticleHistory, answer: Answer
-    ) -> Weather:
-        """A weather of which nothing is learned: the simulated motion and the initial look, bit for bit.
+    @cached_property
+    def look(self) -> InitialLook:
+        """The initial look of all particles; collided ones are in the light of their place."""
+        look = initial_look(self.effect, self.history, seed=self.options.seed)
+        return in_place(look, self.history, self.answer, self.scene.frame.to_metric(self.scene.gaussians.means))
 
-        Args:
-            prepared: the scene on a device.
-            effect: the weather.
-            options: how the motion was simulated.
-            history: the motion in metres, on that device.
-            answer: of the frozen scene, on that device.
-        """
-        scene = prepared.scene
-        look = initial_look(effect, history, seed=options.seed)
-        look = in_place(look, history, answer, scene.frame.to_metric(scene.gaussians.means))
-        sequence = Rollout(history, look, DynamicsField.for_history(history), exposure=effect.appearance.exposure)
-        return Weather(prepared, effect, options, history, answer, sequence)
+    @cached_property
+    def sequence(self) -> GaussianSequence:
+        """What is shown of the motion: what is trained, or the simulated motion and the initial look, bit for bit."""
+        if self.trained is not None:
+            return self.trained
+        # A field that has learned nothing adds nothing.
+        field = DynamicsField.for_history(self.history)
+        return Rollout(self.history, self.look, field, exposure=self.effect.appearance.exposure)
 
     def __repr__(self) -> str:
         what = f"{self.effect.name} in {self.scene.name}, {self.frame_count / self.fps:g} s"
@@ -179,7 +176,7 @@ class Weather:
 
     def shown_by(self, sequence: GaussianSequence) -> Weather:
         """The same weather with another motion and look, such as a trained one."""
-        return replace(self, sequence=sequence)
+        return replace(self, trained=sequence)
 
     def save(self, folder: str | Path) -> Path:
         """Keep the weather in a folder: motion, answer, effect and options; the scene itself stays where it is.
@@ -216,4 +213,4 @@ class Weather:
         parts, frame = open_parts(Path(folder).expanduser(), prepared.scene)
         prepared = replace(prepared, scene=replace(prepared.scene, frame=frame))
         history, answer = parts.history.to(prepared.device), parts.answer.to(prepared.device)
-        return Weather.untrained(prepared, parts.effect, parts.options, history, answer)
+        return Weather(prepared, parts.effect, parts.options, history, answer)
