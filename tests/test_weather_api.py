@@ -150,6 +150,14 @@ def test_a_device_that_is_not_there_is_said(scene, device):
         pgsd_nerfstudio.simulate(scene, device=device)
 
 
+def test_making_and_opening_a_weather_draws_nothing_from_the_random_stream_of_training(scene, tmp_path: Path):
+    before = torch.get_rng_state()
+    made = pgsd_nerfstudio.simulate(scene, seconds=0.2, max_particles=50, progress=False)
+    opened = pgsd_nerfstudio.Weather.open(made.save(tmp_path), scene)
+    assert len(opened.look.active.opacity) == len(made.history)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_words_become_weather(scene):
     purple = pgsd_nerfstudio.EffectOptions(weather="purple snow")
     made = pgsd_nerfstudio.simulate(scene, purple, seconds=0.2, max_particles=50, progress=False)
