@@ -7,7 +7,7 @@ opacities in 0..1); checkpoints store logarithms and logits instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,6 +31,9 @@ class Gaussians:
     displacements: Float[Tensor, "n 3"] | None = None
     """Displacement of each Gaussian while the shutter is open, centred on its mean, in the same units; rendered as motion blur.
     None: nothing moves."""
+    antialiased: bool = False
+    """Whether opacities are those before the blur of a pixel: the blur then takes from a Gaussian's peak what it adds to its area
+    (Yu et al., "Mip-Splatting", 2024; gsplat's rasterize_mode "antialiased"). False: the blur leaves them as they are."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -55,7 +58,7 @@ class Gaussians:
     @property
     def tensors(self) -> dict[str, Tensor]:
         """All tensors that are not None, by field name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        return {f.name: tensor for f in fields(self) if isinstance(tensor := getattr(self, f.name), Tensor)}
 
     @property
     def device(self) -> torch.device:
@@ -63,14 +66,14 @@ class Gaussians:
 
     def to(self, *args, **kwargs) -> Gaussians:
         """The same Gaussians on another device or in another dtype; arguments as for `Tensor.to`."""
-        return Gaussians(**{name: tensor.to(*args, **kwargs) for name, tensor in self.tensors.items()})
+        return replace(self, **{name: tensor.to(*args, **kwargs) for name, tensor in self.tensors.items()})
 
     def detach(self) -> Gaussians:
-        return Gaussians(**{name: tensor.detach() for name, tensor in self.tensors.items()})
+        return replace(self, **{name: tensor.detach() for name, tensor in self.tensors.items()})
 
     def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Gaussians:
         """The chosen Gaussians, by mask or by index."""
-        return Gaussians(**{name: tensor[which] for name, tensor in self.tensors.items()})
+        return replace(self, **{name: tensor[which] for name, tensor in self.tensors.items()})
 
     def check_finite(self) -> None:
         """Refuse values that are not finite.
@@ -90,8 +93,16 @@ class Gaussians:
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join several sets of the same kind of colour (all RGB, or all of one SH degree) in their order."""
-    joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians)}
+    """Join several sets of the same kind of colour (all RGB, or all of one SH degree) in their order.
+
+    Raises:
+        ValueError: some of them are antialiased and others are not.
+    """
+    antialiased = {part.antialiased for part in parts}
+    if len(antialiased) > 1:
+        raise ValueError("Gaussians that are antialiased and such that are not cannot be joined to one set")
+    joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians) if f.name != "antialiased"}
     still = [moved is None for moved in joined["displacements"]]
     joined["displacements"] = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]
-    return Gaussians(**{n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)})
+    tensors = {n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)}
+    return Gaussians(**tensors, antialiased=antialiased == {True})
