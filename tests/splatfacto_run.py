@@ -15,7 +15,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.scene.splats import read_ply
+from pgsd_nerfstudio.scene.splats.ply import read_ply
 
 STEP = 29_999
 

@@ -89,7 +89,7 @@ def test_eval_and_export_end_well(run: Path):
     assert 0 <= results["drift_m"] < 0.1 and results["changed_by_weather"] > 0
     succeed(run, "ns-export", "gaussian-splat", "--load-config", CONFIG, "--output-dir", "export")
 
-    from pgsd_nerfstudio.scene.splats import read_ply
+    from pgsd_nerfstudio.scene.splats.ply import read_ply
 
     assert len(read_ply(run / "export/splat.ply")) > 80_000
 

@@ -359,7 +359,7 @@ def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Pa
     from nerfstudio.scripts.exporter import ExportGaussianSplat
 
     from pgsd_nerfstudio.response.answer import baked
-    from pgsd_nerfstudio.scene.splats import read_ply
+    from pgsd_nerfstudio.scene.splats.ply import read_ply
 
     ExportGaussianSplat(load_config=run, output_dir=tmp_path).main()
     pipeline = opened(run)

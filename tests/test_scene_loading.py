@@ -16,7 +16,8 @@ from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.capture import in_run, read_capture
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import SceneError
-from pgsd_nerfstudio.scene.splats import read_checkpoint, read_ply
+from pgsd_nerfstudio.scene.splats.checkpoint import read_checkpoint
+from pgsd_nerfstudio.scene.splats.ply import read_ply
 
 
 def write_ply(path: Path, n: int = 5, degree: int = 0, drop: str = "", **values) -> np.ndarray:

@@ -12,7 +12,8 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.capture import in_run, read_capture
 from pgsd_nerfstudio.scene.frame import estimate_frame
 from pgsd_nerfstudio.scene.scene import Scene, SceneError
-from pgsd_nerfstudio.scene.splats import read_checkpoint, read_ply
+from pgsd_nerfstudio.scene.splats.checkpoint import read_checkpoint
+from pgsd_nerfstudio.scene.splats.ply import read_ply
 
 RunCameras = Callable[[Path], tuple[Cameras, tuple[Path, ...]]]
 """Function from the config.yml of a run to its cameras (in the coordinates of the splat) and photographs."""
