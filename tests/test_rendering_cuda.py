@@ -100,7 +100,7 @@ def moving_gaussians(n: int, *, degree: int | None, moves: bool) -> Gaussians:
 
 
 def leaf_of(gaussians: Gaussians, dtype: torch.dtype, device: str) -> Gaussians:
-    return Gaussians(**{n: t.clone().to(device, dtype).requires_grad_() for n, t in gaussians.tensors.items()})
+    return replace(gaussians, **{n: t.clone().to(device, dtype).requires_grad_() for n, t in gaussians.tensors.items()})
 
 
 def assert_same_picture_and_gradients(rasterizer: GsplatRasterizer, frozen: Gaussians, dynamic: Gaussians, device: str):

@@ -17,7 +17,7 @@ NAMES = ["means", "quats", "scales", "opacities", "colors"]
 
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
-    return Gaussians(**{name: t.detach().clone().to(dtype).requires_grad_() for name, t in gaussians.tensors.items()})
+    return replace(gaussians, **{n: t.detach().clone().to(dtype).requires_grad_() for n, t in gaussians.tensors.items()})
 
 
 def gradients(cameras, frozen, dynamic, outputs=Rendering._fields, seed=0):

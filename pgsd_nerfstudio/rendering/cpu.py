@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,7 +86,7 @@ class CpuRasterizer:
                 if moment is not None:
                     colors = moment.moving_colors(colors, moving.means, Viewpoint.of(cameras, k, moving.means))
                 tensors = {**moving.tensors, "colors": colors}
-                frames.append(_RenderMerged.apply(view, frozen, self.config, *tensors.values()))
+                frames.append(_RenderMerged.apply(view, frozen, self.config, moving.antialiased, *tensors.values()))
         clip = torch.stack(frames)
         behind = backgrounds(background, cameras, at, clip)
         return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], behind)
@@ -97,6 +98,7 @@ class _Walk(NamedTuple):
     view: View
     part: Binned | Layers
     dynamic: Binned
+    antialiased: bool
     ids: np.ndarray
     """[m] int32: the index of the Gaussian of each splat in `dynamic`."""
     limits: tuple[np.float32, np.float32]
@@ -109,15 +111,15 @@ class _RenderMerged(torch.autograd.Function):
     """One frame [5, h, w] as in blending.py, with gradients for the tensors of its dynamic Gaussians."""
 
     @staticmethod
-    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, *tensors: Tensor) -> Tensor:
-        dynamic, ids = splat(Gaussians(*tensors), view)
+    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, antialiased: bool, *tensors: Tensor) -> Tensor:
+        dynamic, ids = splat(replace(Gaussians(*tensors), antialiased=antialiased), view)
         image = frozen.image.copy()
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
         scene = dynamic, width, height, *limits, image
         blend_merged(frozen.part, *scene)
         ctx.save_for_backward(*tensors)
-        ctx.walk = _Walk(view, frozen.part, dynamic, ids, limits, image)
+        ctx.walk = _Walk(view, frozen.part, dynamic, antialiased, ids, limits, image)
         return torch.from_numpy(image)
 
     @staticmethod
@@ -125,12 +127,12 @@ class _RenderMerged(torch.autograd.Function):
     def backward(ctx: Any, to_image: Tensor) -> tuple[Tensor | None, ...]:
         gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
         typed = (gradient.to(tensor.dtype) for gradient, tensor in zip(gradients, ctx.saved_tensors, strict=True))
-        return None, None, None, *typed
+        return None, None, None, None, *typed
 
 
 def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:
     """Gradients of the tensors of the dynamic Gaussians, in the order of these tensors."""
-    view, part, dynamic, ids, limits, image = walk
+    view, part, dynamic, antialiased, ids, limits, image = walk
     lens = view.lens
     to_splats = np.zeros((workers(), len(ids), GRADIENT_COLUMNS), np.float32)
     scene = dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats
@@ -139,5 +141,6 @@ def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tens
     motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
     found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]
     outputs = found if len(motions) else [*found, np.zeros((0, 3), np.float32)]
-    project_backward(means, quats, scales, motions, view.viewmat, lens, ids, dynamic.splats, totals, *outputs)
+    projected = means, quats, scales, motions, antialiased, view.viewmat, lens
+    project_backward(*projected, ids, dynamic.splats, totals, *outputs)
     return [torch.from_numpy(gradient) for gradient in found]

@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
+from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
 from pgsd_nerfstudio.rendering.isects import Isects, merge
 from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
-from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
+from pgsd_nerfstudio.rendering.motion_blur import footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
@@ -170,14 +170,11 @@ class GsplatRasterizer:
         return [tensor[0] for tensor in found]
 
     def _opacities(self, gaussians: Gaussians, view: Viewpoint) -> Float[Tensor, " m"]:
-        """Opacities averaged over the exposure, of Gaussians in front of the camera."""
-        if gaussians.displacements is None:
-            return gaussians.opacities
+        """Opacities on the image plane, of Gaussians in front of the camera."""
         turn = view.viewmat[:3, :3]
         points = gaussians.means @ turn.T + view.viewmat[:3, 3]
         to_image = perspective_jacobians(points, view.K, view.width, view.height, self.config.frustum_margin) @ turn
-        flat = to_image @ covariances(gaussians) @ to_image.mT + self.config.blur * torch.eye(2, device=turn.device)
-        return gaussians.opacities * dimming(flat, (to_image @ gaussians.displacements[:, :, None])[:, :, 0])
+        return footprint_opacities(gaussians, to_image, self.config.blur)
 
 
 def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:

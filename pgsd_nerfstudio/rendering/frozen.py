@@ -78,6 +78,7 @@ def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple
         float_array(gaussians.scales),
         float_array(gaussians.opacities),
         motions_array(gaussians),
+        gaussians.antialiased,
         view.viewmat,
         view.lens,
         splats,

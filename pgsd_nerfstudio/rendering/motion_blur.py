@@ -1,4 +1,6 @@
-"""Motion blur: a Gaussian that moves while the shutter is open becomes a longer, fainter Gaussian.
+"""How opacities follow the size of a footprint: motion blur and the blur of a pixel.
+
+A Gaussian that moves while the shutter is open becomes a longer, fainter Gaussian.
 
 A uniform distribution of length l has the variance l^2 / 12 (Johnson, Kotz and Balakrishnan, "Continuous Univariate
 Distributions" 2, 1995, section 26.2). A Gaussian that moves by d at constant speed is, averaged over the exposure, convolved
@@ -10,6 +12,9 @@ The sum of a Gaussian's alpha over the pixels is proportional to its opacity tim
 plane. The exposure does not change this sum, hence opacity' = opacity sqrt(det S / det S'). Two things are approximate: the
 profile along the streak is a bell instead of a plateau with soft ends, and each Gaussian is averaged by itself, before those in
 front of it cover it.
+
+What is antialiased keeps its sum of alpha under the blur of a pixel in the same way: its opacity takes the factor
+sqrt(det S0 / det S), S0 its covariance on the image plane without the blur (Yu et al., "Mip-Splatting", 2024, section 4.2).
 """
 
 from __future__ import annotations
@@ -26,6 +31,32 @@ def stretched_covariances(gaussians: Gaussians) -> Float[Tensor, "n 3 3"]:
     """Covariances in space averaged over the exposure, in scene units squared; without displacements those of `covariances`."""
     still, moved = covariances(gaussians), gaussians.displacements
     return still if moved is None else still + moved[:, :, None] * moved[:, None, :] / 12.0
+
+
+def footprint_opacities(
+    gaussians: Gaussians,
+    to_image: Float[Tensor, "n 2 3"],  # as of `perspective_jacobians`, from the axes of the means
+    blur: float,  # pixels squared
+) -> Float[Tensor, " n"]:
+    """Opacities on the image plane: averaged over the exposure of what moves, and under the blur of what is antialiased."""
+    opacities = gaussians.opacities
+    if gaussians.displacements is None and not gaussians.antialiased:
+        return opacities
+    sharp = to_image @ covariances(gaussians) @ to_image.mT
+    blurred = sharp + blur * torch.eye(2).to(sharp)
+    if gaussians.antialiased:
+        area, blurred_area = determinants(sharp), determinants(blurred)
+        # What has no area, such as a disc seen edge-on, takes no light; the root has no gradient there.
+        seen = area > 0
+        opacities = opacities * torch.where(seen, (torch.where(seen, area, 1.0) / blurred_area).sqrt(), 0.0)
+    if gaussians.displacements is not None:
+        opacities = opacities * dimming(blurred, (to_image @ gaussians.displacements[:, :, None])[:, :, 0])
+    return opacities
+
+
+def determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, " n"]:
+    """Determinants of symmetric matrices."""
+    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] ** 2
 
 
 def dimming(

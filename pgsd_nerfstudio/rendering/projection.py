@@ -10,7 +10,8 @@ projection itself runs in double precision: it is a small part of the time, and 
 
 A Gaussian that moves by d while the shutter is open is smeared: a uniform distribution of length |d| has the variance
 |d|^2 / 12, so the motion enters the footprint like a fourth axis of that variance. The smeared footprint is larger and its peak
-lower by sqrt(det / det'), so that it takes as much light as the moving Gaussian does on average over the exposure.
+lower by sqrt(det / det'), so that it takes as much light as the moving Gaussian does on average over the exposure. In the same
+way the blur of a pixel lowers the peak of an antialiased Gaussian: det is then that of the footprint before the blur.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ RED, GREEN, BLUE = 6, 7, 8
 DEPTH = 9  # along the camera's z axis, scene units
 CUTOFF = 10  # largest sigma at which alpha reaches min_alpha
 LEFT, RIGHT, TOP, BOTTOM = 11, 12, 13, 14  # pixels that may be touched, end exclusive; LEFT = RIGHT if there are none
-DIMMING = 15  # factor of the opacity for the motion
+DIMMING = 15  # factor of the opacity for the motion, and for the blur of what is antialiased
 COLUMNS = 16
 
 SMEAR = 1.0 / math.sqrt(12.0)
@@ -184,7 +185,7 @@ def _half_sides(a, b, c, cutoff, lens):
 
 
 @kernel(forceinline=True)
-def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens, splats):
+def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, viewmat, lens, splats):
     """Write the geometry of splat i."""
     splats[i, LEFT] = 0.0
     splats[i, RIGHT] = 0.0
@@ -203,14 +204,17 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, viewmat, lens
     qw, qx, qy, qz, _ = unit_quaternion(quats, i)
     a, b, c = covariance(principal_axes(viewmat, qw, qx, qy, qz), scales, i, bend_x, bend_y, z, lens)
     dimming = 1.0
+    if antialiased or moves:
+        grown = a * c - b * b
+        still = (a - lens.blur) * (c - lens.blur) - b * b if antialiased else grown
     if moves:
-        still = a * c - b * b
         u, v = on_screen(turn(viewmat, (motions[i, 0], motions[i, 1], motions[i, 2])), bend_x, bend_y, z, lens)
         u, v = SMEAR * u, SMEAR * v
         # The determinant by the matrix determinant lemma, without the cancellation of a c - b^2 in a thin streak.
-        grown = still + c * u * u - 2.0 * b * u * v + a * v * v
+        grown = grown + c * u * u - 2.0 * b * u * v + a * v * v
         a, b, c = a + u * u, b + u * v, c + v * v
-        dimming = math.sqrt(still / grown)
+    if antialiased or moves:
+        dimming = math.sqrt(max(still, 0.0) / grown)
         opacity = opacity * dimming
     spread = a - b * b / c
     if not spread > 0.0 or opacity < lens.min_alpha:
@@ -237,16 +241,18 @@ def project(
     scales: np.ndarray,  # [n, 3] float32
     opacities: np.ndarray,  # [n] float32
     motions: np.ndarray,  # [n, 3] float32, or [0, 3] where nothing moves
+    antialiased: bool,
     viewmat: np.ndarray,  # [4, 4] float64
     lens: Lens,
     splats: np.ndarray,  # [n, 16] float32, written
 ) -> None:
     """Write the geometry of all splats and leave their colours as they are."""
-    share_out(_project, workers(), means, quats, scales, opacities, motions, viewmat, lens, splats)
+    share_out(_project, workers(), means, quats, scales, opacities, motions, antialiased, viewmat, lens, splats)
 
 
 @kernel()
-def _project(worker, workers, means, quats, scales, opacities, motions, viewmat, lens, splats):
+def _project(worker, workers, means, quats, scales, opacities, motions, antialiased, viewmat, lens, splats):
     n, moves = means.shape[0], motions.shape[0] > 0
     for i in range(n * worker // workers, n * (worker + 1) // workers):
-        _project_one(i, means, quats, scales, np.float64(opacities[i]), motions, moves, viewmat, lens, splats)
+        opacity = np.float64(opacities[i])
+        _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, viewmat, lens, splats)

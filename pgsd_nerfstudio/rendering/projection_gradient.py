@@ -76,6 +76,7 @@ def _project_one_backward(
     scales,
     motions,
     moves,
+    antialiased,
     viewmat,
     lens,
     m,
@@ -110,11 +111,14 @@ def _project_one_backward(
 
     g_bend_x, g_bend_y, g_z = 0.0, 0.0, np.float64(gradients[m, DEPTH])
     stretch_x, stretch_y = lens.focal_x / z, lens.focal_y / z
-    if moves:
+    if moves or antialiased:
         # The opacity was multiplied by sqrt(still / smeared); these are log-derivatives of the two determinants.
         half = 0.5 * gradients[m, OPACITY] * splats[m, OPACITY]
+        if antialiased:
+            a0, c0 = a0 - lens.blur, c0 - lens.blur
         still, smeared = half / (a0 * c0 - b0 * b0), half / (a * c - b * b)
         g_a, g_b, g_c = g_a - smeared * c, g_b + 2.0 * smeared * b, g_c - smeared * a
+    if moves:
         g_u, g_v = SMEAR * (2.0 * g_a * u + g_b * v), SMEAR * (2.0 * g_c * v + g_b * u)
         g_z -= (g_u * u + g_v * v) / (SMEAR * z)
         g_bend_x -= g_u * stretch_x * way[2]
@@ -123,6 +127,7 @@ def _project_one_backward(
         g_w = -g_x * bend_x - g_y * bend_y
         for n in range(3):
             to_motions[i, n] = viewmat[0, n] * g_x + viewmat[1, n] * g_y + viewmat[2, n] * g_w
+    if moves or antialiased:
         g_a, g_b, g_c = g_a + still * c0, g_b - 2.0 * still * b0, g_c + still * a0
 
     # From the covariance to the projected axes, then to scales, linearisation and the axes in the world.
@@ -155,6 +160,7 @@ def project_backward(
     quats: np.ndarray,  # [n, 4] float32
     scales: np.ndarray,  # [n, 3] float32
     motions: np.ndarray,  # [n, 3] or [0, 3] float32
+    antialiased: bool,
     viewmat: np.ndarray,  # [4, 4] float64
     lens: Lens,
     ids: np.ndarray,  # [m] int32: the Gaussian of each splat
@@ -163,7 +169,8 @@ def project_backward(
     *found: np.ndarray,  # float32, of means, quats, scales, opacities, colours, motions; rows not in `ids` stay as they are
 ) -> None:
     """Write the gradients of the Gaussians from those of their splats."""
-    share_out(_project_backward, workers(), means, quats, scales, motions, viewmat, lens, ids, splats, gradients, *found)
+    scene = means, quats, scales, motions, antialiased, viewmat, lens
+    share_out(_project_backward, workers(), *scene, ids, splats, gradients, *found)
 
 
 @kernel()
@@ -174,6 +181,7 @@ def _project_backward(
     quats,
     scales,
     motions,
+    antialiased,
     viewmat,
     lens,
     ids,
@@ -199,6 +207,7 @@ def _project_backward(
             scales,
             motions,
             moves,
+            antialiased,
             viewmat,
             lens,
             m,

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from pgsd_nerfstudio.rendering.ewa import covariances, perspective_jacobians
+from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
 from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
-from pgsd_nerfstudio.rendering.motion_blur import dimming, stretched_covariances
+from pgsd_nerfstudio.rendering.motion_blur import determinants, footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig, Rendering, composite
 from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -34,7 +34,7 @@ class Projection(NamedTuple):
     depths: Float[Tensor, " n"]
     """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure if the Gaussian moves."""
+    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased."""
     radii: Float[Tensor, "n 2"]
     """Half sides of the footprint along x and y in whole pixels, 0 if the Gaussian is not drawn."""
 
@@ -59,19 +59,12 @@ def project_reference(
     centers = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
     to_image = perspective_jacobians(points, K, width, height, config.frustum_margin) @ viewmat[:3, :3]
     unit = torch.eye(2).to(K)
-    flat = to_image @ covariances(gaussians) @ to_image.mT + config.blur * unit
-    opacities = gaussians.opacities
-    if gaussians.displacements is not None:
-        opacities = opacities * dimming(flat, (to_image @ gaussians.displacements[:, :, None])[:, :, 0])
-        flat = to_image @ stretched_covariances(gaussians) @ to_image.mT + config.blur * unit
-    drawn = seen & (_determinants(flat) > 0)
+    flat = to_image @ stretched_covariances(gaussians) @ to_image.mT + config.blur * unit
+    opacities = footprint_opacities(gaussians, to_image, config.blur)
+    drawn = seen & (determinants(flat) > 0)
     radii = _half_sides(flat, opacities, config)
     inside = ((centers + radii > 0) & (centers - radii < torch.tensor([width, height]).to(K))).all(dim=-1)
     return Projection(centers, flat, points[:, 2], opacities, torch.where((drawn & inside)[:, None], radii, 0.0))
-
-
-def _determinants(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, " n"]:
-    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] ** 2
 
 
 @torch.no_grad()
@@ -82,7 +75,7 @@ def _half_sides(
     variances = covariances.diagonal(dim1=1, dim2=2)
     if config.footprint == "square":
         mean = variances.mean(dim=1, keepdim=True)
-        largest = mean + (mean**2 - _determinants(covariances)[:, None]).clamp_min(0.01).sqrt()
+        largest = mean + (mean**2 - determinants(covariances)[:, None]).clamp_min(0.01).sqrt()
         return (config.radius_sigmas * largest.sqrt()).ceil().expand(-1, 2)
     sigmas = (2.0 * (opacities / config.min_alpha).clamp_min(1.0).log()).sqrt().clamp_max(config.radius_sigmas)
     return (sigmas[:, None] * variances.sqrt()).ceil()
@@ -102,7 +95,7 @@ def _blend(
     """Red, green, blue, weighted depth and accumulation at pixel centres, of Gaussians that are given nearest first."""
     dx, dy = (pixels[:, None, :] - projection.centers).unbind(-1)
     a, b, c = projection.covariances.flatten(1)[:, [0, 1, 3]].unbind(-1)
-    sigma = (0.5 * (c * dx**2 + a * dy**2) - b * dx * dy) / _determinants(projection.covariances)
+    sigma = (0.5 * (c * dx**2 + a * dy**2) - b * dx * dy) / determinants(projection.covariances)
     alpha = (projection.opacities * torch.exp(-sigma)).clamp_max(config.max_alpha)
     alpha = torch.where(alpha >= config.min_alpha, alpha, 0.0)
     after = torch.cumprod(1.0 - alpha, dim=1)

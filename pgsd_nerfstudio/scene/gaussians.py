@@ -7,7 +7,8 @@ opacities in 0..1); checkpoints store logarithms and logits instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,9 +32,9 @@ class Gaussians:
     displacements: Float[Tensor, "n 3"] | None = None
     """Displacement of each Gaussian while the shutter is open, centred on its mean, in the same units; rendered as motion blur.
     None: nothing moves."""
-    antialiased: bool = False
-    """Whether opacities are those before the blur of a pixel: the blur then takes from a Gaussian's peak what it adds to its area
-    (Yu et al., "Mip-Splatting", 2024; gsplat's rasterize_mode "antialiased"). False: the blur leaves them as they are."""
+    antialiased: bool = field(default=False, kw_only=True)
+    """Whether opacities are those before the blur of a pixel: the blur then takes from a Gaussian's peak what it adds to its
+    area (Yu et al., "Mip-Splatting", 2024; gsplat's rasterize_mode "antialiased"). False: the blur leaves them as they are."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -56,7 +57,7 @@ class Gaussians:
         return None if self.colors.ndim == 2 else round(self.colors.shape[1] ** 0.5) - 1
 
     @property
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Any]:
         """All tensors that are not None, by field name."""
         return {f.name: tensor for f in fields(self) if isinstance(tensor := getattr(self, f.name), Tensor)}
 
@@ -104,5 +105,5 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians) if f.name != "antialiased"}
     still = [moved is None for moved in joined["displacements"]]
     joined["displacements"] = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]
-    tensors = {n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)}
+    tensors: dict[str, Any] = {n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)}
     return Gaussians(**tensors, antialiased=antialiased == {True})

@@ -222,7 +222,7 @@ def _compilation(quick: bool) -> list[Record]:
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
     """The same with gradients of their own."""
-    return Gaussians(**{name: t.detach().clone().to(dtype).requires_grad_() for name, t in gaussians.tensors.items()})
+    return replace(gaussians, **{n: t.detach().clone().to(dtype).requires_grad_() for n, t in gaussians.tensors.items()})
 
 
 def weights_for(cameras: Cameras) -> Tensor:
