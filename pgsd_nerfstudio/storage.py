@@ -1,13 +1,15 @@
 """Content-addressed storage of results that are costly to compute: meshes, motion priors, the demo scene.
 
 A file is named by the hash of everything it was made from, so a stale file is never read. A file is written under a temporary
-name and then renamed, so a half-written file never carries the final name.
+name and then renamed, so a half-written file never carries the final name. A file of tensors holds a digest of all that is in
+it, which is compared whenever it is read: a disk or a copy that changes a single bit is noticed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import uuid
 from collections.abc import Iterator, Mapping
@@ -17,9 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
+
+_log = logging.getLogger(__name__)
 
 
 def cache_dir() -> Path:
@@ -102,7 +107,8 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, 
     try:
         with atomic_write(path) as temporary:
             data = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-            save_file(data, temporary, metadata={"about": json.dumps(dict(about or {}))})
+            described = json.dumps(dict(about or {}))
+            save_file(data, temporary, metadata={"about": described, "digest": _digest(data, described)})
     except (OSError, SafetensorError) as error:
         raise OSError(
             f"could not write {path}: {error}; free some space or set PGSD_CACHE to a folder on another disk"
@@ -110,13 +116,30 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, 
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """The tensors and the description of a stored file; None if the file is missing or damaged. A damaged file is removed."""
+    """The tensors and the description of a stored file; None if there is none, or if it is damaged, which is logged."""
     if not path.is_file():
         return None
     try:
         with safe_open(path, framework="pt") as stored:
             tensors = {name: stored.get_tensor(name) for name in list(stored.keys())}
-            return tensors, json.loads((stored.metadata() or {}).get("about", "{}"))
-    except (SafetensorError, OSError, json.JSONDecodeError):
-        path.unlink(missing_ok=True)
-        return None
+            metadata = stored.metadata() or {}
+        described = metadata.get("about", "")
+        if metadata.get("digest") == _digest(tensors, described):
+            return tensors, json.loads(described)
+        fault = "its content is not what was written" if "digest" in metadata else "it was written by an older version"
+    except (SafetensorError, OSError, ValueError) as error:
+        fault = " ".join(str(error).split())
+    _log.warning("%s is damaged and is not read: %s", path, fault)
+    return None
+
+
+def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
+    """SHA-256 of names, types, shapes and values of the tensors, and of their description."""
+    digest = hashlib.sha256(described.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\0{name}\0{tensor.dtype}{tuple(tensor.shape)}".encode())
+        # As bytes, since NumPy has no bfloat16; torch sees none in a tensor of one value with an odd stride.
+        flat = tensor.contiguous().as_strided((tensor.numel(),), (1,))
+        digest.update(flat.view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -16,7 +16,7 @@ from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.record.codec import quantised
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
-from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
+from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
     tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
     plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born, "carry": chunk.state.carry.hex()}
     try:
-        save_tensors(_path(folder, index), tensors, {**plain, "content": content_key(tensors, plain)})
+        save_tensors(_path(folder, index), tensors, plain)
     except OSError:
         return False
     return True
@@ -99,8 +99,7 @@ def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | Non
     if stored is None:
         return None
     tensors, about = stored
-    content = about.pop("content", None)
-    if content != content_key(tensors, about) or (about.get("start"), about.get("frames")) != (start, frames):
+    if (about.get("start"), about.get("frames")) != (start, frames):
         return None
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
     state = RunState.of(without_prefix(_STATE, arrays), about["born"], float.fromhex(about["carry"]))
