@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
 
-from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio, run_cameras, to_nerfstudio
+from pgsd_nerfstudio.plugin.run_cameras import DATAPARSERS, from_nerfstudio, run_cameras, to_nerfstudio
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import SceneError
@@ -81,30 +80,92 @@ def test_after_a_checkpoint_was_read_nerfstudios_own_can_be_loaded_still(splatfa
     assert torch.load(tmp_path / "step.ckpt")["lr"] == 0.25
 
 
-def test_a_run_whose_photographs_moved_says_so(splatfacto_run: Path, tmp_path: Path):
-    copy = tmp_path / "config.yml"
-    config = yaml.load((splatfacto_run / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.datamanager.data = tmp_path / "gone"
-    copy.write_text(yaml.dump(config))
+def rewritten(run: Path, config_path: Path, *changes: tuple[str, str]) -> Path:
+    """A copy of a run's config.yml with some of its text replaced, each piece where it stands first."""
+    text = (run / "config.yml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    config_path.parent.mkdir(parents=True, exist_ok=True)
+    config_path.write_text(text)
+    return config_path
+
+
+def saved_data(path: Path) -> str:
+    """How PyYAML writes a path."""
+    return "!!python/object/apply:pathlib.PosixPath\n" + "\n".join(f"- {part}" for part in path.parts)
+
+
+def test_a_run_whose_photographs_moved_says_so(splatfacto_run: Path, garden_data: Path, tmp_path: Path):
+    gone = (saved_data(garden_data), saved_data(tmp_path / "gone"))
     with pytest.raises(SceneError, match=r"photographs of .* no longer at .*gone.*--data"):
-        run_cameras(copy)
+        run_cameras(rewritten(splatfacto_run, tmp_path / "config.yml", gone))
 
 
-def test_data_is_found_relative_to_a_folder_above_the_run(splatfacto_run: Path, garden_data: Path, tmp_path: Path):
-    run = tmp_path / "outputs" / "run"
-    run.mkdir(parents=True)
-    config = yaml.load((splatfacto_run / "config.yml").read_text(), Loader=yaml.Loader)
-    config.pipeline.datamanager.data = Path("captures/garden")
-    (run / "config.yml").write_text(yaml.dump(config))
+@pytest.mark.parametrize("saved", ["captures/garden", "/elsewhere/project/captures/garden"])
+def test_data_is_found_relative_to_a_folder_above_the_run(splatfacto_run: Path, garden_data: Path, tmp_path: Path, saved: str):
+    run = rewritten(
+        splatfacto_run, tmp_path / "outputs" / "run" / "config.yml", (saved_data(garden_data), saved_data(Path(saved)))
+    )
     (tmp_path / "captures" / "garden").mkdir(parents=True)
     shutil.copy(garden_data / "transforms.json", tmp_path / "captures" / "garden")
     (tmp_path / "captures" / "garden" / "images").symlink_to(garden_data / "images")
-    cameras, images = run_cameras(run / "config.yml")
+    cameras, images = run_cameras(run)
     assert len(cameras) == len(images) > 100
+    assert images[0].is_relative_to(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["just words", "- [", "!!python/object:nowhere.Config {}"])
+PARSER = "nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig"
+
+
+def test_a_config_from_anybody_runs_nothing_but_a_dataparser_that_reads_cameras(splatfacto_run: Path, tmp_path: Path):
+    """nerfstudio's reader would make the folder as it reads the file; a target, as it makes what it has read."""
+    evidence = tmp_path / "evidence"
+    call = f"!!python/object/apply:os.mkdir [{evidence}]"
+    target = "dataparser: !!python/object:" + PARSER + "\n      _target: "
+    hostile = rewritten(
+        splatfacto_run,
+        tmp_path / "config.yml",
+        ("experiment_name: garden", f"experiment_name: {call}"),
+        (
+            f"{target}!!python/name:nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio ''",
+            f"{target}!!python/name:os.mkdir ''",
+        ),
+    )
+    assert len(run_cameras(hostile)[0]) > 100
+    assert not evidence.exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            PARSER,
+            "nerfstudio.data.dataparsers.minimal_dataparser.MinimalDataParserConfig",
+            "asks for the dataparser nerfstudio",
+        ),
+        (PARSER, "os.path.Nothing", r"asks for the dataparser os\.path\.Nothing, which is not run .*pass --data"),
+        ("center_method: poses", "center_method: !!python/object:os.PathLike {}", "center_method of its dataparser"),
+        ("      scale_factor: 1.0", "      scale_factor: many", r"could not read .*pass --data"),
+        ("eval_mode: fraction", "eval_mode: nothing", r"could not read .*pass --data"),
+    ],
+)
+def test_what_no_dataparser_can_be_made_of_is_refused_in_a_sentence(splatfacto_run: Path, tmp_path: Path, old, new, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        run_cameras(rewritten(splatfacto_run, tmp_path / "config.yml", (old, new)))
+
+
+@pytest.mark.parametrize(
+    "text", ["just words", "- [", "!!python/object:nowhere.Config {}", "!!python/object:a.B {pipeline: 1}"]
+)
 def test_what_is_no_config_is_refused_in_a_sentence(text: str, tmp_path: Path):
     (tmp_path / "config.yml").write_text(text)
     with pytest.raises(SceneError, match=r"config\.yml"):
         run_cameras(tmp_path / "config.yml")
+
+
+def test_all_dataparsers_that_are_run_exist():
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+    offered = {f"{type(config).__module__}.{type(config).__name__}" for config in all_dataparsers.values()}
+    assert offered >= DATAPARSERS

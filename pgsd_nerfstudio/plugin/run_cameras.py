@@ -1,45 +1,69 @@
-"""Cameras and photographs of a nerfstudio run, read by the run's own dataparser: they lie in the coordinates of its splat."""
+"""Cameras and photographs of a nerfstudio run, read by the run's own dataparser: they lie in the coordinates of its splat.
+
+config.yml is read as data. Of what it says only the plain options of a dataparser are used, and only dataparsers of nerfstudio
+are made that read cameras without running anything they find.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
 
+from pgsd_nerfstudio.plugin.places import found
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.run_config import Record, entry, read_run_config
 from pgsd_nerfstudio.scene.scene import SceneError
+
+# Those of nerfstudio 1.1.5, without minimal_dataparser, which unpickles, and nuscenes_dataparser, which needs another package.
+DATAPARSERS = {
+    f"nerfstudio.data.dataparsers.{module}_dataparser.{name}DataParserConfig"
+    for module, name in (
+        *(("nerfstudio", "Nerfstudio"), ("colmap", "Colmap"), ("blender", "Blender"), ("instant_ngp", "InstantNGP")),
+        *(("arkitscenes", "ARKitScenes"), ("dnerf", "DNeRF"), ("dycheck", "Dycheck"), ("nerfosr", "NeRFOSR")),
+        *(("phototourism", "Phototourism"), ("scannet", "ScanNet"), ("scannetpp", "ScanNetpp"), ("sdfstudio", "SDFStudio")),
+        ("sitcoms3d", "Sitcoms3D"),
+    )
+}
+PLAIN = (bool, int, float, str, Path, type(None))
 
 
 def run_cameras(config_path: Path) -> tuple[Cameras, tuple[Path, ...]]:
     """Training views of a run, from its config.yml, as nerfstudio itself would place them.
 
+    Nothing that the file names is imported or called but one of `DATAPARSERS`.
+
     Raises:
         SceneError: the config cannot be read, its data has moved, or its cameras are not of the pinhole kind.
     """
-    config = _read_config(config_path)
-    manager = getattr(getattr(config, "pipeline", None), "datamanager", None)
-    parser_config = getattr(manager, "dataparser", None)
-    if manager is None or parser_config is None:
+    manager = entry(read_run_config(config_path), "pipeline", "datamanager")
+    record = entry(manager, "dataparser")
+    if not isinstance(record, Record):
         raise SceneError(f"{config_path} is not the config.yml of a splatfacto run: it names no dataparser")
     # A saved dataparser says data "."; where the photographs lie is said one level up.
-    saved = Path(manager.data or parser_config.data)
-    parser_config.data = next((place for place in _places(saved, config_path) if place.exists()), None)
-    if parser_config.data is None:
+    saved = entry(manager, "data") or entry(record, "data")
+    saved = Path(saved) if isinstance(saved, str) else saved
+    if not isinstance(saved, Path):
+        raise SceneError(f"{config_path} does not say where its photographs lie: pass --data with their transforms.json")
+    data = found(saved, config_path.resolve().parent)
+    if data is None:
         raise SceneError(
-            f"the photographs of {config_path} are no longer at {saved}: move them back, run the command where the training "
-            "was run, or pass --data with their transforms.json"
+            f"the photographs of {config_path} are no longer at {saved}, nor below a folder above the run: move them back, run "
+            "the command where the training was run, or pass --data with their transforms.json"
         )
+    config = _dataparser_config(config_path, record, data)
     try:
-        outputs = parser_config.setup().get_dataparser_outputs(split="train")
-    except (AssertionError, OSError, KeyError, ValueError) as error:
+        outputs = config.setup().get_dataparser_outputs(split="train")
+    except (Exception, SystemExit) as error:
+        # Whatever a dataparser meets in files that are not as it wants them; one ends the process where it may not ask.
         raise SceneError(
-            f"the dataparser of {config_path} could not read {parser_config.data} ({error}): pass --data with a transforms.json"
+            f"the dataparser of {config_path} could not read {data} ({error!r}): pass --data with a transforms.json"
         ) from error
     return from_nerfstudio(outputs.cameras), tuple(Path(name) for name in outputs.image_filenames)
 
@@ -81,16 +105,27 @@ def to_nerfstudio(cameras: Cameras, times: torch.Tensor | None = None) -> Nerfst
     )
 
 
-def _read_config(config_path: Path) -> Any:
-    try:
-        return yaml.load(config_path.read_text("utf-8"), Loader=yaml.Loader)
-    except (OSError, yaml.YAMLError, AttributeError, ImportError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SceneError(f"{config_path} is not a config.yml of this nerfstudio ({reason}): pass --data instead") from error
+def _dataparser_config(config_path: Path, record: Record, data: Path) -> Any:
+    """The configuration that a record stands for, with the class's own target whatever the file says."""
+    if record.python not in DATAPARSERS:
+        raise SceneError(
+            f"{config_path} asks for the dataparser {record.python}, which is not run for a file that may come from anybody: "
+            "pass --data with the transforms.json that it was trained on"
+        )
+    module, _, name = record.python.rpartition(".")
+    kind = getattr(import_module(module), name)
+    known = {field.name for field in fields(kind)} - {"_target", "data"}
+    options = {name: value for name, value in record.items() if name in known}
+    odd = [name for name, value in options.items() if not _plain(value)]
+    if odd:
+        raise SceneError(f"{config_path}: {', '.join(odd)} of its dataparser must be plain values: pass --data instead")
+    if name == "ColmapDataParserConfig" and options.get("downscale_factor") is None:
+        images = data / options.get("images_path", "images")
+        # Asked for a size by nobody, it wants to make smaller photographs first; their cameras are the same.
+        if not list(images.parent.glob(f"{images.name}_*")):
+            options["downscale_factor"] = 1
+    return kind(**options, data=data)
 
 
-def _places(saved: Path, config_path: Path) -> Iterator[Path]:
-    """Where the data may lie: as saved, or relative to a folder above the run (nerfstudio saves paths as they were typed)."""
-    yield saved
-    if not saved.is_absolute():
-        yield from (parent / saved for parent in config_path.resolve().parents)
+def _plain(value: Any) -> bool:
+    return all(map(_plain, value)) if isinstance(value, list | tuple) else isinstance(value, PLAIN)
