@@ -283,7 +283,8 @@ def test_every_command_holds_the_same_records(command):
 FLAGS = (
     "--weather", "glittering green snow", "--intensity", "2.5", "--exposure", "0.01", "--amount", "1.5", "--size", "0.5",
     "--wind", "3", "--wind-direction", "-45", "--color", "#204060", "--haze-color", "lavender", "--haze", "0.5", "--onset", "1",
-    "--ends", "9", "--accumulation", "False", "--ambience", "False", "--accumulation-speedup", "20",
+    "--ends", "9", "--visibility", "koschmieder", "--accumulation", "False", "--ambience", "False",
+    "--accumulation-speedup", "20",
 )  # fmt: skip
 
 

@@ -115,9 +115,10 @@ def test_fog_dims_light_and_holds_water_as_the_gamma_models_do(fog, count, power
 
 
 def test_visibility_in_fog_is_that_of_koschmieder():
-    assert visibility(FOG) == pytest.approx(3.912 / extinction(FOG), rel=1e-4)
-    assert visibility(FOG) == pytest.approx(140, rel=0.01)
-    assert visibility(radiation_fog()) == pytest.approx(500, rel=0.01)
+    assert visibility(FOG) == pytest.approx(2.9957 / extinction(FOG), rel=1e-4)
+    assert visibility(FOG, 0.02) == pytest.approx(3.912 / extinction(FOG), rel=1e-4)
+    assert visibility(FOG, 0.02) == pytest.approx(140, rel=0.01)
+    assert visibility(radiation_fog(), 0.02) == pytest.approx(500, rel=0.01)
 
 
 @pytest.mark.parametrize(("sand", "median"), [(blown_sand, 158e-6), (coarse_sand, 707e-6)])

@@ -1,7 +1,7 @@
 """Fog: droplets that are too small and too many to be seen one by one, carried by the wind in parcels.
 
 Each simulated particle is a parcel of air with its droplets; all parcels have the same extinction. The sizes are those of
-Shettle & Fenn's advection fog (1979), the visibility follows Koschmieder (1924): extinction = ln 50 / visibility.
+Shettle & Fenn's advection fog (1979).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FOG = register(
     Effect(
         name="fog",
         emission=Emission(
-            kind="fog droplets", intensity=25.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35
+            kind="fog droplets", intensity=20.0, smallest=2e-6, largest=150e-6, importance=2.0, most=400, share=0.35
         ),
         material=Material(mass_milligram=0.5236, mass_exponent=3.0, speed_law="fog"),
         wind=Wind(speed=0.5, gustiness=0.25, turbulence=0.12, flutter=0.0, diffusivity=0.01),

@@ -14,6 +14,12 @@ Array = TypeVar("Array", ndarray, "Tensor")
 
 Kind = Literal["snowflakes", "raindrops", "fog droplets", "sand grains"]
 
+Visibility = Literal["optical-range", "koschmieder"]
+
+CONTRASTS: dict[Visibility, float] = {"optical-range": 0.05, "koschmieder": 0.02}
+"""Share of a black object's contrast that is left at the visibility: 5 % for the meteorological optical range of weather
+services (WMO, "Guide to Instruments and Methods of Observation", No. 8, volume I, chapter 9), 2 % in Koschmieder (1924)."""
+
 _RANGES: dict[Kind, tuple[float, float, str, str]] = {
     "snowflakes": (0.0, 100.0, "mm/h of water", "heavy snow is about 3"),
     "raindrops": (0.1, 200.0, "mm/h of water", "heavy rain brings 10 to 50"),
@@ -33,8 +39,9 @@ class Emission:
     """Law of the sizes: Gunn & Marshall (1958) for snowflakes, Marshall & Palmer (1948) for raindrops, Shettle & Fenn's
     advection fog (1979), or the blown sand of Tegen et al. (2002)."""
     intensity: float
-    """Snow and rain: precipitation in mm/h of liquid water. Fog and sand: visibility in metres, the distance at which a black
-    object has 2 % of its contrast left."""
+    """Snow and rain: precipitation in mm/h of liquid water. Fog and sand: visibility in metres."""
+    visibility: Visibility = "optical-range"
+    """What visibility means: the distance at which a black object has `CONTRASTS` of its contrast left."""
     smallest: float = 0.001
     """Smallest simulated diameter in metres; smaller particles carry little water and are not seen."""
     largest: float = 0.012
@@ -55,6 +62,8 @@ class Emission:
             raise ValueError(f"intensity must lie in {low:g}-{high:g} {unit}, got {self.intensity:g}; {hint}")
         if not 0.0 < self.smallest < self.largest:
             raise ValueError(f"diameters must satisfy 0 < smallest < largest, got {self.smallest:g} and {self.largest:g} m")
+        if self.visibility not in CONTRASTS:
+            raise ValueError(f"visibility must be {' or '.join(CONTRASTS)}, got {self.visibility!r}")
         if not 0.0 < self.share <= 1.0:
             raise ValueError(f"share must lie in 0-1, got {self.share:g}")
 

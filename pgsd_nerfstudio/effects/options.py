@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from pgsd_nerfstudio.effects.matter import CONTRASTS, Visibility
+
 if TYPE_CHECKING:
     from pgsd_nerfstudio.effects.effect import Effect, Wind
     from pgsd_nerfstudio.effects.haze import Haze
@@ -53,7 +55,10 @@ class EffectOptions:
     By default the provider's own, or what OPENAI_BASE_URL, ANTHROPIC_BASE_URL, ... say."""
     intensity: float | None = None
     """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20).
-    Fog and sand as visibility in metres (dense fog 60). By default what effect or words say."""
+    Fog and sand as visibility in metres (dense fog 50). By default what effect or words say."""
+    visibility: Visibility = "optical-range"
+    """What visibility means: optical-range is that of weather services and roads, at which 5 % of the contrast are left
+    (extinction ln 20 / visibility); koschmieder has 2 % left (ln 50 / visibility): for the same number thicker air."""
     amount: float = 1.0
     """Factor on how much, 0.1-5: 2 doubles snow and rain, and halves the visibility of fog and sand."""
     size: float = 1.0
@@ -113,6 +118,7 @@ class EffectOptions:
             wind=self._wind(effect),
             timeline=self._timeline(effect.timeline),
             surface=self._surface(effect.surface),
+            emission=replace(effect.emission, visibility=self.visibility),
             haze=self._haze(effect.haze),
             ambience=effect.ambience if self.ambience else None,
         )
@@ -137,6 +143,8 @@ class EffectOptions:
             raise ValueError(f"--llm-url {self.llm_url} needs the name of a model there: add --llm PROVIDER:NAME")
         if self.llm is not None:
             check_model(self.llm, self.llm_url)
+        if self.visibility not in CONTRASTS:
+            raise ValueError(f"--visibility must be {' or '.join(CONTRASTS)}, got {self.visibility!r}")
         for name, (low, high, unit) in {**RANGES, **{name: (*LIMITS[name], "") for name in ("amount", "size")}}.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
@@ -210,6 +218,8 @@ class EffectOptions:
         """What the effect has no use for."""
         if effect.haze is None and (self.haze not in (0, 1) or self.haze_color is not None):
             yield f"--haze and --haze-color change nothing: the air between the particles of {effect.name} is clear"
+        if self.visibility != EffectOptions.visibility and effect.emission.precipitates:
+            yield f"--visibility {self.visibility} changes nothing: {effect.name} is measured in {effect.emission.unit}"
         if self.accumulation_speedup is not None and not (effect.surface.landing == "stays" and effect.surface.accumulates):
             yield f"--accumulation-speedup {self.accumulation_speedup:g} changes nothing: {effect.name} leaves no layer here"
 

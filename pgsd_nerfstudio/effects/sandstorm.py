@@ -17,7 +17,7 @@ QUARTZ = Material(mass_milligram=1.3875, mass_exponent=3.0, speed_law="sand")  #
 SANDSTORM = register(
     Effect(
         name="sandstorm",
-        emission=Emission(kind="sand grains", intensity=40.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
+        emission=Emission(kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
         timeline=Timeline(onset=5.0, arrives="as a front"),

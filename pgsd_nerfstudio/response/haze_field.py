@@ -1,12 +1,12 @@
 """The haze of a weather as a function of place and time: its extinction, its patches, and its arrival.
 
-Fog and sand follow Koschmieder (1924): extinction = ln 50 / visibility. For rain and snow the extinction is twice the shadow of
-the particles that bring the precipitation, of all natural sizes and not only the simulated ones. For rain this is 1.15-1.25
-times the 1.076 R^0.67 dB/km of Carbonneau & Wisely (1998), from 1 to 50 mm/h. Flakes have the area of the aggregates of
-Mitchell, "Use of mass- and area-dimensional power laws for determining precipitation particle terminal velocities" (1996,
-table 1), A = 0.2285 D^1.88 in cm, a third of a disc; full discs would give three times the extinction. At 1 mm/h of water the
-visibility is half a mile, where weather services draw the line to moderate snow; storms differ from each other by a factor of
-three and more (Rasmussen et al., "The estimation of snowfall rate using visibility", 1999).
+Fog and sand follow from their visibility (`physics.laws.populations.extinction`). For rain and snow the extinction is twice the
+shadow of the particles that bring the precipitation, of all natural sizes and not only the simulated ones. For rain this is
+1.15-1.25 times the 1.076 R^0.67 dB/km of Carbonneau & Wisely (1998), from 1 to 50 mm/h. Flakes have the area of the aggregates
+of Mitchell, "Use of mass- and area-dimensional power laws for determining precipitation particle terminal velocities" (1996,
+table 1), A = 0.2285 D^1.88 in cm, a third of a disc; full discs would give three times the extinction. At 1 mm/h of water,
+where weather services draw the line to moderate snow and say half a mile, 5 % of the contrast are left at three quarters of
+that; storms differ by a factor of three and more (Rasmussen et al., "The estimation of snowfall rate using visibility", 1999).
 """
 
 from __future__ import annotations

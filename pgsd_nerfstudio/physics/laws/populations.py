@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.integrate import cumulative_trapezoid
 
 from pgsd_nerfstudio.effects import snowfall
-from pgsd_nerfstudio.effects.matter import Emission, Material
+from pgsd_nerfstudio.effects.matter import CONTRASTS, Emission, Material
 from pgsd_nerfstudio.physics.laws import fall_speeds, size_distributions
 
 MM_PER_HOUR = 1.0 / 3600.0  # of water, in kg/(m^2 s)
@@ -63,8 +65,12 @@ def number_density(diameter: Float[ndarray, " d"], emission: Emission, material:
 
 
 def extinction(emission: Emission) -> float:
-    """Extinction per metre of fog and sand from their visibility (Koschmieder 1924); 0 for rain and snow."""
-    return 0.0 if emission.precipitates else float(np.log(50.0)) / emission.intensity
+    """Extinction per metre of fog and sand; 0 for rain and snow.
+
+    Contrast falls as exp(-extinction * distance) (Koschmieder 1924), to `CONTRASTS` at the visibility V: ln 20 / V for the
+    meteorological optical range, ln 50 / V for Koschmieder's own.
+    """
+    return 0.0 if emission.precipitates else -math.log(CONTRASTS[emission.visibility]) / emission.intensity
 
 
 def cross_section(diameter: Float[ndarray, " d"]) -> Float[ndarray, " d"]:

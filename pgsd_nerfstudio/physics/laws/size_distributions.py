@@ -228,18 +228,20 @@ def extinction(particles: Distribution) -> float:
     return 2 * math.pi / 4 * particles.moment(2)
 
 
-def visibility(particles: Distribution) -> float:
-    """Distance in metres at which the contrast of a black object falls to 2 % (Koschmieder 1924)."""
-    return math.log(50.0) / extinction(particles)
+def visibility(particles: Distribution, contrast: float = 0.05) -> float:
+    """Distance in metres at which the contrast of a black object falls to `contrast`: 0.05 for the meteorological optical range
+    of weather services (WMO No. 8), 0.02 as in Koschmieder (1924)."""
+    return -math.log(contrast) / extinction(particles)
 
 
 def advection_fog() -> LogNormal:
-    """Dense fog from the sea: effective diameter 40 µm, visibility 140 m (model 1 of Shettle & Fenn 1979)."""
+    """Dense fog from the sea: effective diameter 40 µm, visibility 140 m at 2 % contrast (model 1 of Shettle & Fenn 1979)."""
     return LogNormal.of_effective(27.9e-3, 40e-6, 1 / 6, smallest=1e-6, largest=200e-6)
 
 
 def radiation_fog() -> LogNormal:
-    """Fog of a clear night over land: effective diameter 6 µm, visibility 500 m (model 4 of Shettle & Fenn 1979)."""
+    """Fog of a clear night over land: effective diameter 6 µm, visibility 500 m at 2 % contrast (model 4 of Shettle & Fenn
+    1979)."""
     return LogNormal.of_effective(7.82e-3, 6e-6, 1 / 9, smallest=1e-6, largest=200e-6)
 
 
