@@ -24,11 +24,11 @@ from pgsd_nerfstudio.laboratory.records import Record, print_records, write_reco
 from pgsd_nerfstudio.laboratory.rows.rasterizer import Case, against_torch, costs, leaves, psnr, weights_for
 from pgsd_nerfstudio.laboratory.timing import least
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 @dataclass(frozen=True)

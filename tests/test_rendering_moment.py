@@ -8,9 +8,9 @@ import torch
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.rendering.reference import certain_pixels, render_reference
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 SKY = torch.tensor([0.1, 0.5, 0.9])
 

@@ -11,10 +11,10 @@ import torch
 
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.reference import certain_pixels, project_reference, render_reference
-from pgsd_nerfstudio.rendering.spherical_harmonics import sh_basis, view_colors
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
+from pgsd_nerfstudio.scene.spherical_harmonics import sh_basis, view_colors
 
 FOCAL = 40.0
 

@@ -12,7 +12,6 @@ from pgsd_nerfstudio.effects.effect import EFFECTS, Effect
 from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer, baked
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edits import Edits
@@ -22,6 +21,7 @@ from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 GRID, UNIT = 12, 2.0  # Gaussians along a side of the floor; metres per scene unit
 FRAME = Frame(UNIT, torch.eye(3), torch.zeros(3))

@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 
 from pgsd_nerfstudio.rendering import choose_rasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, view_colors
 from pgsd_nerfstudio.response import edited
 from pgsd_nerfstudio.response.edited import difference, edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
@@ -20,6 +19,7 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0, view_colors
 from pgsd_nerfstudio.storage import content_key
 
 SIDE = 12  # Gaussians along an edge of the slab

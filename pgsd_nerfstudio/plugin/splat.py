@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 REST = 15  # coefficients of degree 1 to 3
 

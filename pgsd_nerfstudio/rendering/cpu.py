@@ -18,10 +18,10 @@ from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.walk import blend_backward, blend_merged
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class CpuRasterizer:

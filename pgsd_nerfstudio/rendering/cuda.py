@@ -21,10 +21,10 @@ from pgsd_nerfstudio.rendering.isects import Isects, merge
 from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.motion_blur import footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class Splats(NamedTuple):

@@ -19,9 +19,9 @@ from pgsd_nerfstudio.rendering.layers import Layers, press
 from pgsd_nerfstudio.rendering.moment import Moment, Viewpoint
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class View(NamedTuple):

@@ -19,9 +19,9 @@ from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
 from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.motion_blur import determinants, footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig, Rendering, composite
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class Projection(NamedTuple):

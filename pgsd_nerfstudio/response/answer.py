@@ -18,11 +18,11 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.moment import Viewpoint
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, under_sky, wetted
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.rendering.medium import Medium

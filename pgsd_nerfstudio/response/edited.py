@@ -20,12 +20,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0, sh_basis
 from pgsd_nerfstudio.response.edited_pictures import Picture
 from pgsd_nerfstudio.response.edited_views import LEAST_SIDE, EditedViews
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0, sh_basis
 from pgsd_nerfstudio.storage import content_key, load_tensors, save_tensors
 
 # The rates of 3DGS except for the colour, whose 0.0007 a step is too slow to whiten dark surfaces in 1000 steps.

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.response.edited_pictures import Picture
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 SEEN = 0.02  # pixels; Gaussians that light up less than this in every view are not fitted
 LEAST_SIDE = 16  # pixels; the window of structural similarity has 11

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
 

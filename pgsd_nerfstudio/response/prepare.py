@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import domain_of
-from pgsd_nerfstudio.rendering.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
@@ -24,6 +23,7 @@ from pgsd_nerfstudio.response.light import linear, luminance
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 

@@ -13,10 +13,10 @@ from pgsd_nerfstudio.laboratory.rows.rasterizer import bench, leaves, psnr
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig, Rendering
 from pgsd_nerfstudio.rendering.reference import certain_pixels, project_reference, render_reference
-from pgsd_nerfstudio.rendering.spherical_harmonics import view_colors
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians, relative_error
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 _JUDGE = "float64 torch reference, pixels whose decisions do not hang on single precision"
 _NAMES = ["means", "quats", "scales", "opacities", "colors"]
