@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -34,8 +35,8 @@ class Server:
     """Answers in turn what it was told to, the last over and over, and remembers what it was asked."""
 
     protocol: str
-    turns: list[str | int | bytes | None]
-    """An answer of the model, an HTTP status, raw bytes, or None: silence."""
+    turns: list[str | int | bytes | bytearray | None]
+    """An answer of the model, an HTTP status, raw bytes, None: silence, or a bytearray: a byte of it every 50 ms."""
     asked: list[dict[str, Any]] = field(default_factory=list)
     url: str = ""
     done: threading.Event = field(default_factory=threading.Event)
@@ -70,7 +71,7 @@ class Server:
 
 
 @contextmanager
-def serving(protocol: str, *turns: str | int | bytes | None) -> Iterator[Server]:
+def serving(protocol: str, *turns: str | int | bytes | bytearray | None) -> Iterator[Server]:
     told = Server(protocol, list(turns))
 
     class Handler(BaseHTTPRequestHandler):
@@ -90,7 +91,14 @@ def serving(protocol: str, *turns: str | int | bytes | None) -> Iterator[Server]
             self.send_header("retry-after-ms", "1")
             self.send_header("content-length", str(len(sent)))
             self.end_headers()
-            self.wfile.write(sent)
+            if not isinstance(sent, bytearray):
+                self.wfile.write(sent)
+                return
+            for byte in sent:
+                if told.done.wait(0.05):
+                    return
+                self.wfile.write(bytes([byte]))
+                self.wfile.flush()
 
         def log_message(self, *_):
             pass
@@ -220,6 +228,27 @@ def test_silence_ends_after_the_time_that_was_given(protocol, tmp_path):
 
 
 @needs_library
+def test_a_server_that_sends_byte_after_byte_is_waited_for_no_longer(protocol, tmp_path):
+    """Each byte comes in time, all of them would take a minute."""
+    with serving(protocol, bytearray(b" " * 1200)) as server:
+        began = time.monotonic()
+        with pytest.raises(LanguageModelError, match=r"gave no answer within 0\.2 s"):
+            asked(server, tmp_path, timeout=0.2)
+        assert time.monotonic() - began < 5.0
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_library
+@pytest.mark.parametrize(
+    ("answer", "fault"),
+    [('{"a":' * 50_000 + "1" + "}" * 50_000, "at most 100,000 characters"), ('{"a":' * 15_000 + "1" + "}" * 15_000, "deeply")],
+)
+def test_an_absurd_answer_is_refused_in_a_sentence(answer, fault, tmp_path):
+    with serving("openai", answer) as server, pytest.raises(LanguageModelError, match=fault):
+        asked(server, tmp_path)
+
+
+@needs_library
 @pytest.mark.parametrize("body", [b"hello", b"{}", b"[]", b"{"])
 def test_a_server_of_another_kind_is_told_apart(protocol, body, tmp_path):
     sentence = r"did not speak the protocol .* address of its API\?"
@@ -309,7 +338,7 @@ def test_a_kept_answer_may_be_corrected_by_hand_but_not_damaged(tmp_path):
         told = json.loads(stored.read_text("utf-8"))
         stored.write_text(json.dumps(told | {"request": told["request"] | {"size": 2.0}}), "utf-8")
         assert asked(server, tmp_path).size == 2.0
-        for damaged in ("{", "{}", "[]", json.dumps(told | {"request": told["request"] | {"size": 20}})):
+        for damaged in ("{", "{}", "[]", "[" * 100_000, json.dumps(told | {"request": told["request"] | {"size": 20}})):
             stored.write_text(damaged, "utf-8")
             with pytest.raises(
                 LanguageModelError, match=r"stored answer .*request-\w+.json is damaged \(.*\); correct or delete it"

@@ -130,7 +130,7 @@ class EffectOptions:
         Raises:
             ValueError: two options do not go together, or a number is out of its range.
         """
-        from pgsd_nerfstudio.effects.language_model import check_model
+        from pgsd_nerfstudio.effects.connection import check_model
         from pgsd_nerfstudio.effects.request import LIMITS
 
         if self.weather is not None and self.effect != EffectOptions.effect:
