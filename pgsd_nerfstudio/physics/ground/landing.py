@@ -18,6 +18,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.clock import Domain
+from pgsd_nerfstudio.physics.ground.sampling import points_within
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import Hits, SurfaceMesh
@@ -106,9 +107,11 @@ class Ground:
         cell = max(CELL, (domain.volume / MAX_CELLS) ** (1 / 3))
         shape = tuple(np.ceil(np.asarray(domain.size) / cell).astype(int) + 1)
         near = torch.zeros(shape)
-        cells = np.floor((sample_triangles(triangle_corners(surface), cell / 2) - lower) / cell).astype(int)
-        cells = cells[((cells >= -BAND) & (cells < np.asarray(shape) + BAND)).all(1)].clip(0, np.asarray(shape) - 1)
-        near[tuple(cells.T)] = 1.0
+        room = BAND * cell  # around the domain; a surface there makes cells at the border near
+        for points in points_within(surface, lower - room, lower + cell * np.asarray(shape) + room, cell / 2):
+            cells = np.floor((points - lower) / cell).astype(int)
+            cells = cells[((cells >= -BAND) & (cells < np.asarray(shape) + BAND)).all(1)].clip(0, np.asarray(shape) - 1)
+            near[tuple(cells.T)] = 1.0
         for axis in range(3):  # grow a cube axis by axis
             pooled = near.movedim(axis, 2).reshape(1, -1, shape[axis])
             pooled = torch.nn.functional.max_pool1d(pooled, 2 * BAND + 1, 1, BAND)
@@ -271,27 +274,3 @@ def _rotations(normal: Float[ndarray, "n 3"], spin: Float[ndarray, " n"]) -> Flo
     w, x, y = w / size, x / size, y / size
     c, s = np.cos(half), np.sin(half)
     return np.stack([w * c, x * c + y * s, y * c - x * s, w * s], 1).astype(np.float32)
-
-
-def triangle_corners(surface: SurfaceMesh) -> Float[ndarray, "f 3 3"]:
-    """The three corners of each triangle, metres."""
-    return surface.vertices.numpy(force=True)[surface.triangles.numpy(force=True)]
-
-
-def sample_triangles(corners: Float[ndarray, "f 3 3"], spacing: float) -> Float[ndarray, "s 3"]:
-    """Points on triangles, so dense that every point of a triangle has one within `spacing`.
-
-    Args:
-        corners: of the triangles, m.
-        spacing: m.
-    """
-    edges = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1) if len(corners) else np.zeros(0)
-    # Triangles of similar size are sampled together, so that a large triangle does not refine the small ones.
-    steps = 2 ** np.ceil(np.log2(np.maximum(edges / spacing, 1.0))).astype(int)
-    points = [np.zeros((0, 3))]
-    for count in np.unique(steps):
-        first, second = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
-        u, v = (grid[first + second <= count] / count for grid in (first, second))
-        weights = np.stack([1 - u - v, u, v], 1)
-        points.append(np.einsum("sc,fcd->fsd", weights, corners[steps == count]).reshape(-1, 3))
-    return np.concatenate(points)

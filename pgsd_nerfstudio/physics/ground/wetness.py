@@ -10,6 +10,7 @@ the cells. A step of any length is the exact exponential: inside the band the wa
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.ground.landing import sample_triangles, triangle_corners
+from pgsd_nerfstudio.physics.ground.sampling import points_within
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 MAX_CELLS = 20_000_000  # 2.2 GB
@@ -49,12 +50,16 @@ class WetnessGrid:
     """Water in the cells near a surface. Each cell is centred on a lattice point, whose index is its key."""
 
     def __init__(
-        self, points: Float[ndarray, "p 3"], lower: Float[ndarray, "3"], shape: tuple[int, int, int], wetting: Wetting
+        self,
+        points: Iterable[Float[ndarray, "p 3"]],
+        lower: Float[ndarray, "3"],
+        shape: tuple[int, int, int],
+        wetting: Wetting,
     ):
         """Make the cells within `Wetting.reach` of the surface.
 
         Args:
-            points: points that cover the surface, m.
+            points: points that cover the surface, in pieces, m.
             lower: first point of the lattice, m.
             shape: lattice points along each axis.
             wetting: cell size and laws of spreading and drying.
@@ -83,9 +88,11 @@ class WetnessGrid:
             ValueError: there would be more than 20 million cells.
         """
         wetting = wetting or Wetting()
-        corners = triangle_corners(surface).astype(np.float64)
         x, y, z = (math.ceil(edge / wetting.cell) + 1 for edge in domain.size)
-        return WetnessGrid(sample_triangles(corners, wetting.cell / 2), np.asarray(domain.lower, float), (x, y, z), wetting)
+        lower, room = np.asarray(domain.lower, float), wetting.cell * (wetting.reach + 1)
+        upper = lower + wetting.cell * np.array([x, y, z])
+        points = points_within(surface, lower - room, upper + room, wetting.cell / 2)
+        return WetnessGrid(points, lower, (x, y, z), wetting)
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -208,24 +215,29 @@ class WetnessGrid:
         found = np.searchsorted(self.keys, keys).clip(max=len(self) - 1)
         return found, self.keys[found] == keys
 
-    def _near(self, points: Float[ndarray, "p 3"]) -> Int[ndarray, " c"]:
+    def _near(self, points: Iterable[Float[ndarray, "p 3"]]) -> Int[ndarray, " c"]:
         """Sorted keys of the lattice points within `reach` cells of the points along every axis."""
         # Points up to `reach` outside of the lattice also make cells inside. Keys are one number each, since sorting rows of
         # three takes far longer.
         reach, wide = self.wetting.reach, tuple(side + 2 * self.wetting.reach for side in self.shape)
-        at = np.rint((points - self.lower) / self.wetting.cell).astype(np.int64) + reach
-        at = at[((at >= 0) & (at < wide)).all(1)]
-        keys = np.unique(np.ravel_multi_index(tuple(at.T), wide))
+        keys = np.zeros(0, np.int64)
+        for piece in points:
+            at = np.rint((piece - self.lower) / self.wetting.cell).astype(np.int64) + reach
+            at = at[((at >= 0) & (at < wide)).all(1)]
+            keys = np.union1d(keys, np.ravel_multi_index(tuple(at.T), wide))
         steps = np.arange(-reach, reach + 1)
         for axis in range(3):  # grow a cube axis by axis
-            place = np.stack(np.unravel_index(keys, wide), 1)
-            moved = np.repeat(place, len(steps), 0)
-            moved[:, axis] += np.tile(steps, len(place))
-            moved = moved[(moved[:, axis] >= 0) & (moved[:, axis] < wide[axis])]
-            keys = np.unique(np.ravel_multi_index(tuple(moved.T), wide))
+            self._require_room(len(keys))
+            stride = math.prod(wide[axis + 1 :])
+            place = keys // stride % wide[axis]
+            moved = [keys[(place + step >= 0) & (place + step < wide[axis])] + step * stride for step in steps]
+            keys = np.unique(np.concatenate(moved))
         at = np.stack(np.unravel_index(keys, wide), 1) - reach
         at = at[((at >= 0) & (at < self.shape)).all(1)]
-        if len(at) > MAX_CELLS:
-            edge = self.wetting.cell
-            raise ValueError(f"wetness needs at most {MAX_CELLS:,} cells, {edge:g} m make {len(at):,}; take larger cells")
+        self._require_room(len(at))
         return np.sort(np.ravel_multi_index(tuple(at.T), self.shape))
+
+    def _require_room(self, cells: int) -> None:
+        if cells > MAX_CELLS:
+            edge = self.wetting.cell
+            raise ValueError(f"wetness needs at most {MAX_CELLS:,} cells, {edge:g} m make {cells:,}; take larger cells")
