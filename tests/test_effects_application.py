@@ -309,7 +309,7 @@ def test_every_kind_that_the_reader_knows_can_be_applied():
             ["--weather", "purple snow", "--effect", "fog"],
             "--weather stands in place of --effect, got both 'purple snow' and fog",
         ),
-        (["--weather", "purple snow", "--intensity", "-2"], "intensity must lie in 0-100 mm/h of water, got -2"),
+        (["--weather", "purple snow", "--intensity", "-2"], "intensity must lie in 0.01-100 mm/h of water, got -2"),
         (["--weather", "thin fog", "--exposure", "3"], "exposure must lie in 0-1 s, got 3"),
     ],
 )

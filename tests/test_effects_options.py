@@ -217,9 +217,10 @@ def test_the_prompt_stays_that_of_effect_or_words():
 # What is refused.
 
 REFUSED: list[tuple[dict[str, Any], str]] = [
-    ({"intensity": -2}, "intensity must lie in 0-100 mm/h of water, got -2; heavy snow is about 3"),
-    ({"intensity": 1e9}, "intensity must lie in 0-100 mm/h of water, got 1e+09"),
-    ({"intensity": math.nan}, "intensity must lie in 0-100 mm/h of water, got nan"),
+    ({"intensity": -2}, "intensity must lie in 0.01-100 mm/h of water, got -2; heavy snow is about 3"),
+    ({"intensity": 1e-9}, "intensity must lie in 0.01-100 mm/h of water, got 1e-09"),
+    ({"intensity": 1e9}, "intensity must lie in 0.01-100 mm/h of water, got 1e+09"),
+    ({"intensity": math.nan}, "intensity must lie in 0.01-100 mm/h of water, got nan"),
     ({"effect": "fog", "intensity": 0}, "intensity must lie in 5-10000 m of visibility, got 0"),
     ({"effect": "hail"}, "there is no effect 'hail'; known are: fog, rainfall, sandstorm, snowfall"),
     ({"amount": 0}, "--amount must lie in 0.1-5, got 0"),

@@ -21,7 +21,7 @@ CONTRASTS: dict[Visibility, float] = {"optical-range": 0.05, "koschmieder": 0.02
 services (WMO, "Guide to Instruments and Methods of Observation", No. 8, volume I, chapter 9), 2 % in Koschmieder (1924)."""
 
 _RANGES: dict[Kind, tuple[float, float, str, str]] = {
-    "snowflakes": (0.0, 100.0, "mm/h of water", "heavy snow is about 3"),
+    "snowflakes": (0.01, 100.0, "mm/h of water", "heavy snow is about 3"),
     "raindrops": (0.1, 200.0, "mm/h of water", "heavy rain brings 10 to 50"),
     "fog droplets": (5.0, 10_000.0, "m of visibility", "dense fog has less than 200"),
     "sand grains": (5.0, 10_000.0, "m of visibility", "a sandstorm has less than 1000"),
@@ -57,8 +57,7 @@ class Emission:
 
     def __post_init__(self) -> None:
         low, high, unit, hint = _RANGES[self.kind]
-        above = self.intensity > low if low == 0 else self.intensity >= low
-        if not (above and self.intensity <= high):
+        if not low <= self.intensity <= high:
             raise ValueError(f"intensity must lie in {low:g}-{high:g} {unit}, got {self.intensity:g}; {hint}")
         if not 0.0 < self.smallest < self.largest:
             raise ValueError(f"diameters must satisfy 0 < smallest < largest, got {self.smallest:g} and {self.largest:g} m")

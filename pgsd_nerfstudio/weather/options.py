@@ -7,7 +7,6 @@ and the options here decide what is simulated and name the file in the cache.
 from __future__ import annotations
 
 import importlib.util
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -24,6 +23,7 @@ PARTICLES_CPU, PARTICLES_CUDA = 20_000, 100_000
 """Most active particles at once, where nothing is asked for: what a roll-out and its pictures take in reasonable time."""
 MOST_SECONDS = 3600.0
 MOST_FRAMES = 200_000
+MOST_PARTICLES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,11 +76,14 @@ class SimulationOptions:
         Raises:
             ValueError: a value is out of its range; one sentence says which.
         """
-        for name, most, unit in (("seconds", MOST_SECONDS, " s"), ("fps", 1000.0, ""), ("max_particles", math.inf, "")):
+        bounds = (("seconds", 0.0, MOST_SECONDS, " s"), ("fps", 1.0, 1000.0, ""), ("max_particles", 0, MOST_PARTICLES, ""))
+        for name, least, most, unit in bounds:
             value = getattr(self, name)
             flag = name.replace("_", "-")
             if value is not None and not value > 0:
                 raise ValueError(f"--{flag} must be positive, got {value:g}{unit}")
+            if value is not None and not value >= least:
+                raise ValueError(f"--{flag} must be at least {least:g}{unit}, got {value:g}{unit}")
             if value is not None and not value <= most:
                 raise ValueError(f"--{flag} must be at most {most:g}{unit}, got {value:g}{unit}")
         if self.seconds * self.fps > MOST_FRAMES:
