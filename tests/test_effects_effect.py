@@ -7,15 +7,23 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 import pytest
 
 from pgsd_nerfstudio.effects import EFFECTS, SNOWFALL, Emission, effect
+from pgsd_nerfstudio.effects.options import EffectOptions
 
 
 def test_effects_are_known_by_name():
     assert effect("snowfall") is SNOWFALL is EFFECTS["snowfall"]
 
 
+@pytest.mark.parametrize(("short", "name"), [("snow", "snowfall"), ("rain", "rainfall"), ("sand", "sandstorm"), ("fog", "fog")])
+def test_an_effect_is_understood_by_what_it_is_called(short, name):
+    assert effect(short) is effect(name)
+    assert EffectOptions(effect=short) == EffectOptions(effect=name)
+    assert EffectOptions(effect=short).resolve()[0] == effect(name)
+
+
 def test_an_unknown_effect_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"there is no effect 'snow'; known are: .*snowfall"):
-        effect("snow")
+    with pytest.raises(ValueError, match=r"there is no effect 'hail'; known are: .*snowfall"):
+        effect("hail")
 
 
 def test_the_prompt_takes_the_description_of_the_scene():

@@ -119,6 +119,13 @@ class Effect:
 
 EFFECTS: dict[str, Effect] = {}
 """The built-in effects by name; the module of each effect registers it."""
+SHORT_NAMES = {"snow": "snowfall", "rain": "rainfall", "sand": "sandstorm"}
+"""What people also call them."""
+
+
+def full_name(name: str) -> str:
+    """The name by which an effect is known, where it has a shorter one; any other name as it is."""
+    return SHORT_NAMES.get(name, name)
 
 
 def register(new: Effect) -> Effect:
@@ -131,16 +138,16 @@ def effect(name: str, *, intensity: float | None = None, exposure: float | None 
     """A built-in effect.
 
     Args:
-        name: snowfall, rainfall, fog or sandstorm.
+        name: snowfall, rainfall, fog or sandstorm; snow, rain and sand are understood too.
         intensity: in the effect's own unit; None: the effect's own.
         exposure: shutter time in seconds; None: the effect's own.
 
     Raises:
         ValueError: there is no effect of that name (the message names the known ones), or a number is out of its range.
     """
-    if name not in EFFECTS:
+    chosen = EFFECTS.get(full_name(name))
+    if chosen is None:
         raise ValueError(f"there is no effect {name!r}; known are: {', '.join(sorted(EFFECTS))}")
-    chosen = EFFECTS[name]
     if intensity is not None:
         chosen = replace(chosen, emission=replace(chosen.emission, intensity=intensity))
     if exposure is not None:

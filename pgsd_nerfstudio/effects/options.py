@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from pgsd_nerfstudio.effects.effect import full_name
 from pgsd_nerfstudio.effects.matter import CONTRASTS, Visibility
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class EffectOptions:
     """What the weather is; `resolve` gives the Effect."""
 
     effect: str = "snowfall"
-    """Which weather: snowfall, rainfall, fog or sandstorm."""
+    """Which weather: snowfall, rainfall, fog or sandstorm; snow, rain and sand are understood too."""
     weather: str | None = None
     """The weather in words, in place of --effect: "purple snow", "glittering yellow sand, no wind", "magic particles".
     A built-in reader understands many words and says which; with --llm a language model is asked, and may be told anything."""
@@ -88,6 +89,10 @@ class EffectOptions:
     exposure: float | None = None
     """Shutter time in seconds: active particles are smeared by speed times this (a film camera: 0.02).
     By default the effect's own, which for snow is 0, no motion blur."""
+
+    def __post_init__(self) -> None:
+        # Stored options, and the commands that are made of them, have one name for one weather.
+        object.__setattr__(self, "effect", full_name(self.effect))
 
     def resolve(self, cache_dir: Path | None = None) -> tuple[Effect, list[str]]:
         """The effect of these options, and what is to be said about it: how the words were read, what cannot be done.
