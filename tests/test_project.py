@@ -80,7 +80,7 @@ def test_ci_finds_its_command_in_the_readme():
     assert "<!-- ci: test -->\n```bash\nscripts/test\n```" in README
 
 
-@pytest.mark.parametrize("name", ["scripts/demo", "scripts/test", "scripts/environment", ".ci/run"])
+@pytest.mark.parametrize("name", ["scripts/demo", "scripts/test", "scripts/environment", "scripts/prove_setup", ".ci/run"])
 def test_shell_scripts_parse(name):
     assert subprocess.run(["bash", "-n", str(ROOT / name)], capture_output=True).stderr == b""
 

@@ -20,7 +20,6 @@ import tyro
 
 from pgsd_nerfstudio.cli.console import console
 from pgsd_nerfstudio.refusal import Refusal, refusing
-from pgsd_nerfstudio.storage import cache_dir
 
 Kind = Literal["demo", "surfaces", "motion", "answers", "edits", "prompts", "requests", "views", "bin"]
 HASH = r"[0-9a-f]{16}"
@@ -155,6 +154,8 @@ class List:
         from rich.console import Console
         from rich.table import Column, Table
 
+        from pgsd_nerfstudio.storage import cache_dir
+
         folder = cache_dir()
         with refusing(OSError):
             files = _chosen(folder, self.kind)
@@ -182,6 +183,8 @@ class Clear:
     """Do not ask."""
 
     def run(self) -> int:
+        from pgsd_nerfstudio.storage import cache_dir
+
         if not self.older_than >= 0:
             raise Refusal(f"--older-than must be a number of days, 0 or more, got {self.older_than:g}")
         folder = cache_dir()
