@@ -1,8 +1,8 @@
 """Silence about what only the developers of nerfstudio 1.1.5 can change: the deprecations of torch that its imports meet.
 
-torch calls `hush` at the end of its own import, by the entry point in the group torch.backends: every command imports torch
-before nerfstudio, and nerfstudio before this plugin, so that anything later would come too late. It runs in every process
-that imports torch where this package is installed, and is therefore cheap and silences nothing but the messages named here.
+torch calls `hush` at the end of its own import, by the entry point in the group torch.backends: every command of nerfstudio
+imports torch before nerfstudio, and nerfstudio before this plugin, so that anything later would come too late. Any other
+process that imports torch where this package is installed calls it too; there it does nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ from __future__ import annotations
 import logging
 import sys
 import warnings
+from pathlib import Path
 
+COMMANDS = ("ns-", "pgsd")
+"""Beginnings of the names of the programs that are silenced."""
 DEPRECATED = (
     r"`torch\.jit\.script` is deprecated",
     r"`torch\.cuda\.amp\.(custom_fwd|custom_bwd|GradScaler)\(args\.\.\.\)` is deprecated",
@@ -21,8 +24,8 @@ CONVERTED = "Converting a tensor with requires_grad=True to a scalar"
 
 
 def hush() -> None:
-    """Ignore these warnings, unless warnings were asked for (`python -W`, PYTHONWARNINGS)."""
-    if sys.warnoptions:
+    """Ignore these warnings in nerfstudio's and our own commands, unless they were asked for (`python -W`, PYTHONWARNINGS)."""
+    if sys.warnoptions or not Path(next(iter(sys.argv), "")).name.startswith(COMMANDS):
         return
     for message in DEPRECATED:
         warnings.filterwarnings("ignore", message=message, category=FutureWarning)
