@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.effects.options import EffectOptions
     from pgsd_nerfstudio.scene.camera_path import slow_path
     from pgsd_nerfstudio.scene.cameras import Cameras
-    from pgsd_nerfstudio.scene.loading import load_scene
     from pgsd_nerfstudio.scene.scene import Scene, SceneError
+    from pgsd_nerfstudio.weather.loading import load_scene
     from pgsd_nerfstudio.weather.making import simulate
     from pgsd_nerfstudio.weather.picture import Picture
     from pgsd_nerfstudio.weather.stored import StoredWeatherError
@@ -57,7 +57,7 @@ _PLACES = {
     "StoredWeatherError": "weather.stored",
     "Weather": "weather.weather",
     "effect": "effects",  # the whole room: its modules register the built-in effects
-    "load_scene": "scene.loading",
+    "load_scene": "weather.loading",
     "simulate": "weather.making",
     "slow_path": "scene.camera_path",
     "write_video": "weather.video",

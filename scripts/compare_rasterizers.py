@@ -26,9 +26,9 @@ from pgsd_nerfstudio.laboratory.timing import least
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
+from pgsd_nerfstudio.weather.loading import load_scene
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import tyro
 
 from pgsd_nerfstudio.scene.camera_path import slow_path
-from pgsd_nerfstudio.scene.loading import load_scene
+from pgsd_nerfstudio.weather.loading import load_scene
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,8 @@ from nerfstudio.cameras.cameras import CameraType
 
 from pgsd_nerfstudio.plugin.run_cameras import DATAPARSERS, from_nerfstudio, run_cameras, to_nerfstudio
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import SceneError
+from pgsd_nerfstudio.weather.loading import load_scene
 
 
 def some_cameras() -> Cameras:
@@ -98,7 +98,7 @@ def saved_data(path: Path) -> str:
 
 def test_a_run_whose_photographs_moved_says_so(splatfacto_run: Path, garden_data: Path, tmp_path: Path):
     gone = (saved_data(garden_data), saved_data(tmp_path / "gone"))
-    with pytest.raises(SceneError, match=r"photographs of .* no longer at .*gone.*--data"):
+    with pytest.raises(SceneError, match=r"photographs of .* no longer at .*gone.*data="):
         run_cameras(rewritten(splatfacto_run, tmp_path / "config.yml", gone))
 
 
@@ -110,9 +110,9 @@ def test_data_is_found_relative_to_a_folder_above_the_run(splatfacto_run: Path, 
     (tmp_path / "captures" / "garden").mkdir(parents=True)
     shutil.copy(garden_data / "transforms.json", tmp_path / "captures" / "garden")
     (tmp_path / "captures" / "garden" / "images").symlink_to(garden_data / "images")
-    cameras, images = run_cameras(run)
-    assert len(cameras) == len(images) > 100
-    assert images[0].is_relative_to(tmp_path)
+    capture = run_cameras(run)
+    assert len(capture) == len(capture.photographs) > 100
+    assert capture.photographs[0].path.is_relative_to(tmp_path)
 
 
 PARSER = "nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig"
@@ -132,7 +132,7 @@ def test_a_config_from_anybody_runs_nothing_but_a_dataparser_that_reads_cameras(
             f"{target}!!python/name:os.mkdir ''",
         ),
     )
-    assert len(run_cameras(hostile)[0]) > 100
+    assert len(run_cameras(hostile)) > 100
     assert not evidence.exists()
 
 
@@ -144,10 +144,10 @@ def test_a_config_from_anybody_runs_nothing_but_a_dataparser_that_reads_cameras(
             "nerfstudio.data.dataparsers.minimal_dataparser.MinimalDataParserConfig",
             "asks for the dataparser nerfstudio",
         ),
-        (PARSER, "os.path.Nothing", r"asks for the dataparser os\.path\.Nothing, which is not run .*pass --data"),
+        (PARSER, "os.path.Nothing", r"asks for the dataparser os\.path\.Nothing, which is not run .*pass data="),
         ("center_method: poses", "center_method: !!python/object:os.PathLike {}", "center_method of its dataparser"),
-        ("      scale_factor: 1.0", "      scale_factor: many", r"could not read .*pass --data"),
-        ("eval_mode: fraction", "eval_mode: nothing", r"could not read .*pass --data"),
+        ("      scale_factor: 1.0", "      scale_factor: many", r"could not read .*pass data="),
+        ("eval_mode: fraction", "eval_mode: nothing", r"could not read .*pass data="),
     ],
 )
 def test_what_no_dataparser_can_be_made_of_is_refused_in_a_sentence(splatfacto_run: Path, tmp_path: Path, old, new, sentence):

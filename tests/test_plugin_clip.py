@@ -14,8 +14,8 @@ from pgsd_nerfstudio.plugin.clip import render_clip, seen_by, surrogate
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.response.prepare import answer_of
 from pgsd_nerfstudio.scene.cameras import interpolate
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.loading import load_scene
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 
 START, FRAMES = 14, 3

@@ -57,7 +57,7 @@ def test_interpolate_shows_weather_that_gathers(run: Path):
 def test_a_camera_path_shows_its_times(run: Path):
     import yaml
 
-    from pgsd_nerfstudio.scene.loading import load_scene
+    from pgsd_nerfstudio.weather.loading import load_scene
 
     options = yaml.load((run / CONFIG).read_text(), Loader=yaml.Loader).pipeline.options
     scene = load_scene(options.scene.load_scene)

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -16,6 +17,8 @@ from pgsd_nerfstudio.response.edited import difference, edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.captures.lenses import pinhole
+from pgsd_nerfstudio.scene.captures.photographs import Photograph
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.scene import Scene
@@ -55,9 +58,9 @@ def from_above(count: int, width: int, height: int) -> Cameras:
 def slab(views: int = 7, width: int = 48, height: int = 32, images: tuple[Path, ...] = ()) -> Scene:
     """A slab seen from above: its underside, a smaller sheet, is hidden by its top."""
     frame = Frame(1.0, torch.eye(3), torch.zeros(3))
-    return Scene(
-        "slab", concatenate([layer(0.0, 1.0, 1), layer(-0.3, 0.4, 2)]), from_above(views, width, height), frame, images
-    )
+    cameras = from_above(views, width, height)
+    photographs = tuple(Photograph(path, pinhole(cameras[index])) for index, path in enumerate(images))
+    return Scene("slab", concatenate([layer(0.0, 1.0, 1), layer(-0.3, 0.4, 2)]), cameras, frame, photographs)
 
 
 def whitened(gaussians: Gaussians) -> Gaussians:
@@ -348,7 +351,7 @@ def write(path: Path, value: int, size: tuple[int, int] = (48, 32)) -> None:
 
 def test_pictures_are_found_by_the_names_of_the_photographs(captured, tmp_path, capsys):
     write(tmp_path / "frame_00003.png", 30)
-    write(tmp_path / "frame_00012.webp", 120, (512, 512))
+    write(tmp_path / "frame_00012.webp", 120, (480, 320))
     write(tmp_path / "frame_00099.jpg", 0)
     Image.new("RGBA", (48, 32), (40, 40, 40, 255)).save(tmp_path / "frame_00040.tif")
     (tmp_path / "frame_00003.txt").write_text("the prompt")
@@ -359,6 +362,32 @@ def test_pictures_are_found_by_the_names_of_the_photographs(captured, tmp_path, 
         assert image.shape == (32, 48, 3) and image.dtype == torch.uint8
         assert (image.float() - value).abs().max() <= 2  # .webp loses a little
     assert "1 of the 4 pictures" in (note := capsys.readouterr().err) and "frame_00099.jpg" in note
+
+
+def test_pictures_of_another_aspect_are_not_stretched_and_change_nothing_beyond_their_edges(captured, tmp_path):
+    """An editor's square of a 48x32 view shows its middle 32 columns; the rest is the scene as it is."""
+    write(tmp_path / "frame_00003.png", 200, (512, 512))
+    ((_, image),) = read_edited(tmp_path, captured)
+    assert (image[:, 8:40] == 200).all()
+    scene = picture(captured.gaussians, captured.cameras, 1)
+    assert torch.equal(image[:, :8], scene[:, :8]) and torch.equal(image[:, 40:], scene[:, 40:])
+
+
+def test_edits_of_a_distorted_photograph_are_undistorted_as_it_is(captured, tmp_path):
+    """A pincushion lens draws what lies 0.25 focal lengths to the right of the middle 0.28 focal lengths to the right."""
+    bent = replace(captured.photographs[1].lens, radial=(2.0,))
+    scene = replace(captured, photographs=tuple(replace(photograph, lens=bent) for photograph in captured.photographs))
+    stripe = np.zeros((32, 48, 3), np.uint8)
+    stripe[:, int(bent.cx + bent.fx * 0.25 * (1 + 2 * 0.25**2))] = 255  # column 36; a pinhole's is 34
+    Image.fromarray(stripe).save(tmp_path / "frame_00003.png")
+    ((_, image),) = read_edited(tmp_path, scene)
+    assert int(image[16, :, 0].argmax()) in (34, 35)
+
+
+def test_sixteen_bits_of_an_edited_picture_are_scaled(captured, tmp_path):
+    Image.fromarray(np.full((32, 48), 51 * 257, np.uint16)).save(tmp_path / "frame_00003.png")
+    ((_, image),) = read_edited(tmp_path, captured)
+    assert (image == 51).all()
 
 
 def test_without_photographs_the_number_in_the_name_is_the_view(tmp_path):

@@ -14,9 +14,9 @@ from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.prepare import answer_of, edits_of, save_answer, softening_of, stored_answer, to_metric
 from pgsd_nerfstudio.response.sunlight import Sunlight
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.loading import load_scene
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from pgsd_nerfstudio.response.rays import open_sky, ray_starts
 from pgsd_nerfstudio.response.sun_search import FEWEST
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.courtyard.baking import SUN, SUN_LIGHT, sky_light
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.weather.loading import load_scene
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
 LOW, HIGH = np.array([-0.5, -0.4, 0.0]), np.array([0.5, 0.4, 1.2])  # of the box, m

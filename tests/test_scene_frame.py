@@ -14,7 +14,7 @@ from rounds import round_of
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame, estimate_frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.scene.loading import load_scene
+from pgsd_nerfstudio.weather.loading import load_scene
 
 
 def some_frame() -> Frame:

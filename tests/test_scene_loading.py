@@ -10,22 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from captures import ring, transforms, write_transforms
 from plyfile import PlyData, PlyElement
 
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
-from pgsd_nerfstudio.scene.capture import in_run, read_capture
-from pgsd_nerfstudio.scene.loading import load_scene
+from pgsd_nerfstudio.scene.captures.placements import run_placement
+from pgsd_nerfstudio.scene.captures.reading import read_capture
+from pgsd_nerfstudio.scene.loading import read_scene
 from pgsd_nerfstudio.scene.scene import SceneError
 from pgsd_nerfstudio.scene.splats.checkpoint import read_checkpoint
-from pgsd_nerfstudio.scene.splats.ply import read_ply
+from pgsd_nerfstudio.scene.splats.reading import read_splat
 
 
-def write_ply(path: Path, n: int = 5, degree: int = 0, drop: str = "", **values) -> np.ndarray:
+def write_ply(path: Path, n: int = 5, degree: int = 0, drop: str = "", double: bool = False, **values) -> np.ndarray:
     """A small splat; returns its structured array."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    table = np.zeros(n, [(name, "f4") for name in names if name != drop])
+    kinds = {name: "f8" if double and name in "xyz" else "f4" for name in names}
+    table = np.zeros(n, [(name, kinds[name]) for name in names if name != drop])
     generator = np.random.default_rng(1)
     for name in table.dtype.names:
         table[name] = values.get(name, generator.normal(size=n))
@@ -33,24 +36,10 @@ def write_ply(path: Path, n: int = 5, degree: int = 0, drop: str = "", **values)
     return table
 
 
-def write_capture(path: Path, **changes) -> Path:
-    """transforms.json of four cameras around the origin; `changes` replace its entries."""
-    frames = []
-    for index, angle in enumerate(np.arange(4) * np.pi / 2):
-        back = np.array([np.cos(angle), np.sin(angle), 0.0])  # OpenGL cameras look along -z
-        right = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, 3 * back], axis=1)
-        frames.append({"file_path": f"images/{index}.jpg", "transform_matrix": pose.tolist()})
-    meta = {"camera_model": "OPENCV", "fl_x": 100.0, "fl_y": 90.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}
-    path.write_text(json.dumps({name: value for name, value in (meta | changes).items() if value is not None}))
-    return path
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_ply_keeps_every_field(tmp_path, degree):
     table = write_ply(tmp_path / "a.ply", degree=degree)
-    read = read_ply(tmp_path / "a.ply")
+    read = read_splat(tmp_path / "a.ply").gaussians
     coefficients = (degree + 1) ** 2
     assert read.sh_degree == degree
     assert read.means[:, 1].numpy() == pytest.approx(table["y"])
@@ -67,19 +56,19 @@ def test_a_ply_keeps_every_field(tmp_path, degree):
 
 def test_a_ply_without_data_asks_for_it(tmp_path):
     write_ply(tmp_path / "a.ply")
-    with pytest.raises(SceneError, match="pass --data"):
-        load_scene(tmp_path / "a.ply")
+    with pytest.raises(SceneError, match=r"holds no cameras: pass data= with .*or camera='orbit'.* up="):
+        read_scene(tmp_path / "a.ply")
 
 
 def test_a_point_cloud_is_no_splat(tmp_path):
     table = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1")])
     PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "cloud.ply"))
     with pytest.raises(SceneError, match=r"no 3D Gaussian splat: it lacks the fields f_dc_0, .*ns-train splatfacto"):
-        load_scene(tmp_path / "cloud.ply", write_capture(tmp_path / "transforms.json"))
+        read_scene(tmp_path / "cloud.ply", write_transforms(tmp_path / "transforms.json"))
 
 
 def test_unusable_plys_say_why(tmp_path):
-    data = write_capture(tmp_path / "transforms.json")
+    data = write_transforms(tmp_path / "transforms.json")
     write_ply(tmp_path / "empty.ply", n=0)
     write_ply(tmp_path / "nan.ply", scale_1=[0, np.nan, np.inf, 0, 0])
     write_ply(tmp_path / "huge.ply", scale_1=100.0)
@@ -100,71 +89,158 @@ def test_unusable_plys_say_why(tmp_path):
     }
     for name, sentence in expected.items():
         with pytest.raises(SceneError, match=sentence) as refusal:
-            load_scene(tmp_path / f"{name}.ply", data)
+            read_scene(tmp_path / f"{name}.ply", data)
         assert f"{name}.ply" in str(refusal.value) and "\n" not in str(refusal.value)
 
 
-def test_unusable_data_says_why(tmp_path):
+@pytest.mark.mistyped
+def test_arguments_that_cannot_be_what_they_are(tmp_path):
+    """Sentences speak of arguments, since Python knows no flags."""
     write_ply(tmp_path / "a.ply")
-    data = tmp_path / "transforms.json"
-    nan_pose = {"file_path": "a.jpg", "transform_matrix": np.full((4, 4), np.nan).tolist()}
-    for changes, sentence in [
-        ({"frames": []}, "has no cameras"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE cameras; undistort"),
-        ({"fl_x": None}, "fl_x must be positive pixel numbers"),
-        ({"w": 0}, "w must be positive pixel numbers"),
-        ({"frames": [{"file_path": "a.jpg"}]}, "a.jpg needs a 4x4 transform_matrix"),
-        ({"frames": [nan_pose]}, "transform_matrix of a.jpg holds a NaN"),
+    ply, data = tmp_path / "a.ply", write_transforms(tmp_path / "transforms.json")
+    scene = read_scene(ply, data)
+    for arguments, sentence in [
+        ((None,), "path must be the path of a file or folder, got NoneType"),
+        ((scene,), "path must be the path of a file or folder, got Scene"),
+        ((7,), "path must be the path of a file or folder, got int"),
+        ((ply, scene), "data must be the path of a file or folder, got Scene"),
+        ((ply, 1.5), "data must be the path of a file or folder, got float"),
+    ]:
+        with pytest.raises(TypeError, match=sentence):
+            read_scene(*arguments)
+    for wrong in (True, "2"):
+        with pytest.raises(TypeError, match="metres_per_unit must be a number"):
+            read_scene(ply, data, metres_per_unit=wrong)
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(SceneError, match="positive number"):
+            read_scene("demo", metres_per_unit=wrong)
+    for wrong in ("w", "+z", "", (0, 0, 0), (1, 2), (0, 0, float("nan")), 7):
+        with pytest.raises(SceneError, match="up must be one of x, y, z, -x, -y, -z, or three numbers"):
+            read_scene(ply, data, up=wrong)
+    for arguments, named, sentence in [
+        (("",), {}, "path is empty"),
+        (("  ",), {}, "path is empty"),
+        ((ply, ""), {}, "data= is empty"),
+        (("nowhere.ply",), {}, "no scene at nowhere.ply: expected a splatfacto run folder"),
+        ((str(ply) + 5000 * "a",), {}, "no scene at"),
+        (("a\0b",), {}, "no scene at a[?]b"),
+        ((ply, tmp_path / "nowhere"), {}, "no data at .*transforms.json, a COLMAP folder, or a cameras.json"),
+        ((ply, ply), {}, "data= must lead to cameras, got the splat"),
+        (("demo", data), {}, "the demo has cameras of its own: leave data= and camera= out"),
+        (("demo",), {"camera": "orbit"}, "the demo has cameras of its own"),
+        ((ply, data), {"camera": "orbit"}, "leave one of the two out"),
+        ((ply,), {"camera": "dolly"}, "camera must be 'orbit'"),
+        ((tmp_path,), {}, "is a folder: pass the splat in it, such as .*a.ply, with data="),
+        ((data,), {}, "holds no splat: if these are its cameras, pass the splat with data="),
+    ]:
+        with pytest.raises(SceneError, match=sentence) as refusal:
+            read_scene(*arguments, **named)
+        assert "--" not in str(refusal.value)
+    (tmp_path / "capture").mkdir()
+    write_transforms(tmp_path / "capture" / "transforms.json")
+    with pytest.raises(SceneError, match=r"holds cameras and no splat: train one \(ns-train splatfacto --data .*with data="):
+        read_scene(tmp_path / "capture")
+
+
+def test_commands_speak_of_flags(tmp_path):
+    from pgsd_nerfstudio.weather.options import SceneOptions
+
+    write_ply(tmp_path / "data=.ply")
+    for options, sentence in [
+        (
+            SceneOptions(load_scene=tmp_path / "data=.ply"),
+            r"/data=\.ply holds no cameras: pass --data with .* or --camera orbit",
+        ),
+        (SceneOptions(load_scene=Path("demo"), data=tmp_path), "leave --data and --camera out"),
+        (SceneOptions(load_scene=Path("demo"), camera="orbit", data=tmp_path), "leave --data and --camera out"),
     ]:
         with pytest.raises(SceneError, match=sentence):
-            load_scene(tmp_path / "a.ply", write_capture(data, **changes))
-    data.write_text("{")
-    with pytest.raises(SceneError, match="cannot be read as JSON"):
-        load_scene(tmp_path / "a.ply", data)
-    with pytest.raises(SceneError, match="no data at"):
-        load_scene(tmp_path / "a.ply", tmp_path / "nowhere")
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(SceneError, match=r"no cameras at .*ns-process-data"):
-        load_scene(tmp_path / "a.ply", tmp_path / "folder")
+            options.check()
+            options.open()
 
 
-def test_the_scale_given_must_be_positive(tmp_path):
-    for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(SceneError, match="positive number"):
-            load_scene("demo", metres_per_unit=wrong)
+def test_up_that_is_given_is_up(tmp_path):
+    write_ply(tmp_path / "a.ply", n=200)
+    data = write_transforms(tmp_path / "transforms.json")
+    for up, direction in (("-y", [0, -1, 0]), ((0, 3, 4), [0, 0.6, 0.8])):
+        frame = read_scene(tmp_path / "a.ply", data, up=up).frame
+        assert (frame.rotation @ torch.tensor(direction, dtype=torch.float32)).tolist() == pytest.approx([0, 0, 1], abs=1e-6)
+        assert "up as given" in frame.source
+    assert read_scene("demo", up="x").frame.rotation[2].tolist() == pytest.approx([1, 0, 0], abs=1e-6)
 
 
-def test_capture_poses_are_opengl_and_sorted_by_name(tmp_path):
-    frames = json.loads(write_capture(tmp_path / "transforms.json").read_text())["frames"]
-    cameras, images = read_capture(write_capture(tmp_path / "transforms.json", frames=frames[::-1]))
-    assert [image.name for image in images] == ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
-    assert images[0].parent == tmp_path / "images"
-    assert cameras.centers[1].tolist() == pytest.approx([0, 3, 0], abs=1e-6)
-    seen = cameras.viewmats @ torch.tensor([0.0, 0.0, 1.0, 1.0])  # one unit above what all look at
-    assert seen[:, :3].numpy() == pytest.approx(np.tile([0, -1, 3], (4, 1)), abs=1e-5)
-    assert cameras.Ks[0].tolist() == [[100, 0, 32], [0, 90, 24], [0, 0, 1]]
+def test_a_scale_that_puts_the_cameras_where_nobody_stands_is_doubted(tmp_path):
+    write_ply(tmp_path / "a.ply", n=200)
+    data = write_transforms(tmp_path / "transforms.json")
+    assert not any("is the scale right" in remark for remark in read_scene(tmp_path / "a.ply", data).remarks)
+    (remark,) = [r for r in read_scene(tmp_path / "a.ply", data, metres_per_unit=1000.0).remarks if "is the scale right" in r]
+    assert "at 1000 m per unit the cameras stand" in remark
 
 
-def test_intrinsics_of_single_frames_and_of_other_image_sizes(tmp_path):
-    meta = json.loads(write_capture(tmp_path / "transforms.json").read_text())
-    own = {name: meta.pop(name) for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
-    for frame in meta["frames"]:
-        frame.update(own)
-    meta["frames"][2].update({name: 2 * value for name, value in own.items()})
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
-    cameras, _ = read_capture(tmp_path)
-    assert (cameras.width, cameras.height) == (64, 48)
-    assert torch.equal(cameras.Ks, torch.tensor([[100.0, 0, 32], [0, 90, 24], [0, 0, 1]]).expand(4, 3, 3))
+def test_photographs_that_are_missing_are_counted(tmp_path):
+    from captures import write_photographs
+
+    write_ply(tmp_path / "a.ply")
+    data = write_transforms(tmp_path / "transforms.json")
+    (remark,) = read_scene(tmp_path / "a.ply", data).remarks
+    assert remark.startswith(f"none of the 4 photographs is there, such as {tmp_path / 'images' / '0.jpg'}")
+    write_photographs(tmp_path, ["images/0.jpg", "images/1.jpg", "images/3.jpg"])
+    scene = read_scene(tmp_path / "a.ply", data)
+    assert scene.remarks == (f"1 of the 4 photographs are missing, such as {tmp_path / 'images' / '2.jpg'}",)
+    assert scene.photographed() == [0, 1, 3]
+
+
+@pytest.mark.parametrize("far", ["both", "only the cameras"])
+def test_georeferenced_scenes_lose_nothing(far, tmp_path):
+    """Splat and cameras at UTM coordinates, in doubles, give the scene that lies at the origin, to a millimetre's hundredth."""
+    place = np.array([500_123.25, 5_400_678.5, 312.25])
+    generator = np.random.default_rng(4)
+    centres = {axis: generator.normal(size=500).astype("f4").astype("f8") for axis in "xyz"}
+    small = {f"scale_{i}": -5.0 for i in range(3)}
+    write_ply(tmp_path / "near.ply", n=500, **centres, **small)
+    near = read_scene(tmp_path / "near.ply", write_transforms(tmp_path / "near.json"))
+    moved = {axis: centre + shift for (axis, centre), shift in zip(centres.items(), place, strict=True)}
+    write_ply(tmp_path / "far.ply", n=500, double=True, **moved, **small)
+    frames = transforms()["frames"]
+    for frame, pose in zip(frames, ring(), strict=True):
+        pose[:3, 3] += place
+        frame["transform_matrix"] = pose.tolist()
+    data = write_transforms(tmp_path / "far.json", frames=frames)
+    found = read_scene(tmp_path / ("far.ply" if far == "both" else "near.ply"), data)
+    seen = [s.cameras.viewmats[:, :3, :3] @ s.gaussians.means.T + s.cameras.viewmats[:, :3, 3:] for s in (near, found)]
+    if far == "both":
+        assert (seen[0] - seen[1]).abs().max() < 1e-5
+        assert (found.cameras.centers.double() + found.offset).numpy() == pytest.approx(ring()[:, :3, 3] + place, abs=1e-5)
+        assert "are moved to the origin" in found.remarks[0]
+    else:  # nothing tells by how much a trainer has moved the splat: the middle of the cameras is taken, in whole units
+        assert found.cameras.centers.abs().max() < 10 and "far from the splat" in found.remarks[0]
+
+
+def test_inria_s_output_folder_is_a_scene_and_a_place_of_cameras(tmp_path):
+    from test_scene_captures_colmap import inria_output
+
+    for iterations, n in ((7_000, 5), (30_000, 8)):
+        folder = tmp_path / "flowers" / "point_cloud" / f"iteration_{iterations}"
+        folder.mkdir(parents=True)
+        write_ply(folder / "point_cloud.ply", n=n)
+    inria_output(tmp_path / "flowers")
+    scene = read_scene(tmp_path / "flowers")
+    assert (scene.name, len(scene.gaussians), len(scene.cameras)) == ("flowers", 8, 4)
+    other = read_scene(folder / "point_cloud.ply", tmp_path / "flowers")
+    assert torch.equal(other.cameras.viewmats, scene.cameras.viewmats)
+    with pytest.raises(SceneError, match=r"holds no cameras: .*or pass the folder .*flowers, which has them"):
+        read_scene(folder / "point_cloud.ply")
 
 
 def test_cameras_follow_the_dataparser_of_a_run(tmp_path):
     """A dataparser that undoes the transform and scale which ns-process-data applied gives back the original poses."""
     applied = np.array([[0.0, 0, 2, 1], [1, 0, 0, 2], [0, 1, 0, 3]]) / [[2, 2, 2, 1], [1, 1, 1, 1], [1, 1, 1, 1]]
-    data = write_capture(tmp_path / "transforms.json", applied_transform=applied.tolist(), applied_scale=4.0)
+    data = write_transforms(tmp_path / "transforms.json", applied_transform=applied.tolist(), applied_scale=4.0)
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 2.0}))
-    saved, _ = read_capture(data)
-    found = in_run(saved, data, tmp_path / "dataparser_transforms.json")
-    original = np.linalg.solve(applied[:, :3], saved.centers.numpy().T - applied[:, 3:]).T
+    saved = read_capture(data)
+    placement = run_placement(tmp_path / "dataparser_transforms.json", saved.applied, saved.applied_scale)
+    found = saved.moved(placement.move).cameras()
+    original = np.linalg.solve(applied[:, :3], ring()[:, :3, 3].T - applied[:, 3:]).T
     assert found.centers.numpy() == pytest.approx(original * 2.0 / 4.0, abs=1e-5)
     looked_at = np.linalg.solve(applied[:, :3], -applied[:, 3]) * 2.0 / 4.0  # where the saved origin is in the run
     seen = found.viewmats @ torch.tensor([*looked_at, 1.0], dtype=torch.float32)
@@ -181,7 +257,7 @@ def test_a_checkpoint_that_would_run_code_is_not_opened(tmp_path):
     (tmp_path / "text.ckpt").write_text("hello")
     for name in ("trap", "pickle", "text"):
         with pytest.raises(SceneError, match=f"{name}.ckpt"):
-            load_scene(tmp_path / f"{name}.ckpt")
+            read_scene(tmp_path / f"{name}.ckpt")
     assert not (tmp_path / "sprung").exists()
 
 
@@ -205,29 +281,29 @@ def test_checkpoints_of_other_methods_and_untrained_runs_say_why(tmp_path):
     (tmp_path / "nerfstudio_models").mkdir()
     torch.save({"pipeline": {"_model.field.mlp": torch.zeros(3)}}, tmp_path / "nerfstudio_models" / "nerf.ckpt")
     with pytest.raises(SceneError, match="holds no Gaussians"):
-        load_scene(tmp_path / "nerfstudio_models" / "nerf.ckpt")
+        read_scene(tmp_path / "nerfstudio_models" / "nerf.ckpt")
     (tmp_path / "config.yml").write_text("")
     with pytest.raises(SceneError, match="no trained run"):
-        load_scene(tmp_path)
-    with pytest.raises(SceneError, match="no scene: expected"):
-        load_scene(Path(__file__))
+        read_scene(tmp_path)
+    with pytest.raises(SceneError, match="no splat: expected"):
+        read_scene(Path(__file__))
 
 
 def test_the_garden_from_its_ply(garden_ply, garden_data):
-    scene = load_scene(garden_ply, garden_data)
+    scene = read_scene(garden_ply, garden_data)
     assert len(scene.gaussians) == 120_000 and scene.gaussians.sh_degree == 1
     assert len(scene.cameras) == len(scene.images) == 185 and scene.images[0].is_file()
     assert (scene.cameras.width, scene.cameras.height) == (512, 512)
     assert (scene.name, scene.description) == ("garden", "a garden")
-    assert scene.content_key() == load_scene(garden_ply, garden_data / "transforms.json").content_key()
-    assert scene.content_key() != load_scene(garden_ply, garden_data, metres_per_unit=1.0).content_key()
+    assert scene.content_key() == read_scene(garden_ply, garden_data / "transforms.json").content_key()
+    assert scene.content_key() != read_scene(garden_ply, garden_data, metres_per_unit=1.0).content_key()
 
 
 def test_a_run_shows_the_garden_where_its_ply_does(splatfacto_run, garden_ply, garden_data, tmp_path, monkeypatch):
     """The splat as seen from the cameras does not depend on the coordinates in which it was stored."""
-    plain = load_scene(garden_ply, garden_data)
+    plain = read_scene(garden_ply, garden_data)
     for path in (splatfacto_run, splatfacto_run / "config.yml", next(splatfacto_run.glob("nerfstudio_models/*.ckpt"))):
-        run = load_scene(path, garden_data)
+        run = read_scene(path, garden_data)
         assert run.name == "garden" and run.images == plain.images
         assert run.gaussians.colors.shape == plain.gaussians.colors.shape
         scale = json.loads((splatfacto_run / "dataparser_transforms.json").read_text())["scale"]
@@ -243,12 +319,12 @@ def test_a_run_shows_the_garden_where_its_ply_does(splatfacto_run, garden_ply, g
     shutil.copytree(splatfacto_run, moved)
     (moved / "dataparser_transforms.json").unlink()
     with pytest.raises(SceneError, match=r"dataparser_transforms\.json is missing"):
-        load_scene(moved, garden_data)
-    # Without --data the run's own dataparser is asked, which an entry point names; where none is installed, that is said.
-    assert len(load_scene(moved).cameras) == 167  # nine tenths of the photographs train
-    monkeypatch.setattr("pgsd_nerfstudio.scene.loading.entry_points", lambda group: ())
-    with pytest.raises(SceneError, match=r"only nerfstudio reads the cameras of .* pass --data"):
-        load_scene(moved)
+        read_scene(moved, garden_data)
+    # Without data the run's own dataparser is asked, which an entry point names; where none is installed, that is said.
+    assert len(read_scene(moved).cameras) == 167  # nine tenths of the photographs train
+    monkeypatch.setattr("pgsd_nerfstudio.scene.source_views.entry_points", lambda group: ())
+    with pytest.raises(SceneError, match=r"only nerfstudio reads the cameras of .* pass data="):
+        read_scene(moved)
 
 
 def _in_cameras(scene):

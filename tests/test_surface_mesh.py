@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,10 @@ import pgsd_nerfstudio.surface.mesh as mesh_module
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
-from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.scene.loading import load_scene
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_from_depths, surface_of
+from pgsd_nerfstudio.weather.loading import load_scene
 
 VOXEL = 0.04  # m
 CENTER, RADIUS = torch.tensor([0.1, 0.0, 0.7]), 0.5
@@ -185,7 +186,7 @@ def test_a_scene_is_fused_in_metres_and_kept(monkeypatch, tmp_path):
 
     (stored,) = Path(tmp_path / "surfaces").iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr(mesh_module, "_render_depths", lambda *_: pytest.fail("the stored surface was not read"))
+        patch.setattr(mesh_module, "render_depths", lambda *_, **__: pytest.fail("the stored surface was not read"))
         again = surface_of(scene, rasterizer, progress=False)
     assert torch.equal(again.vertices, mesh.vertices) and torch.equal(again.triangles, mesh.triangles)
 
@@ -196,6 +197,41 @@ def test_a_scene_is_fused_in_metres_and_kept(monkeypatch, tmp_path):
     assert len(coarser.triangles) < 0.5 * len(mesh.triangles)
     with pytest.raises(ValueError, match="positive number of metres"):
         surface_of(scene, rasterizer, voxel=0.0)
+
+
+def under_a_sky(scene: Scene, radius: float, opacity: float = 0.95) -> Scene:
+    """The scene in a sphere of large bright Gaussians; the radius is in scene units."""
+    count, generator = 400, torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    sky = Gaussians(
+        radius * directions,
+        torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        torch.full((count, 3), 4 * radius / count**0.5),
+        torch.full((count,), opacity),
+        torch.ones(count, 1, 3),
+    )
+    return replace(scene, gaussians=concatenate([scene.gaussians, sky]))
+
+
+@pytest.mark.parametrize("radius", [25.0, 300.0, 20_000.0])
+def test_a_sphere_of_sky_changes_no_surface(radius):
+    """The floor lets a thirtieth of the light through, which mixes the depth of the sky with its own."""
+    scene = floor_scene()
+    leaky = replace(scene, gaussians=replace(scene.gaussians, opacities=0.7 * scene.gaussians.opacities))
+    bare, domed = (
+        surface_of(one, choose_rasterizer(one.gaussians, "cpu"), cache=False, progress=False)
+        for one in (leaky, under_a_sky(leaky, radius))
+    )
+    assert len(bare.triangles) > 1000
+    assert torch.equal(domed.vertices, bare.vertices) and torch.equal(domed.triangles, bare.triangles)
+
+
+def test_a_scene_that_is_all_sky_has_an_empty_surface():
+    scene = floor_scene()
+    nothing = replace(scene, gaussians=scene.gaussians.select(torch.zeros(len(scene.gaussians), dtype=torch.bool)))
+    sky = under_a_sky(nothing, 1000.0)
+    mesh = surface_of(sky, choose_rasterizer(sky.gaussians, "cpu"), cache=False, progress=False)
+    assert len(mesh.triangles) == 0
 
 
 @pytest.mark.slow

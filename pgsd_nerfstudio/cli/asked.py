@@ -46,10 +46,10 @@ class WeatherCommand:
         Raises:
             Refusal: it cannot be used.
         """
-        from pgsd_nerfstudio.scene.loading import load_scene
-
         with refusing(ValueError, OSError):
             say(f"opening {self.scene.load_scene}")
-            scene = load_scene(self.scene.load_scene, self.scene.data, metres_per_unit=self.scene.metres_per_unit)
+            scene = self.scene.open()
         say(f"{len(scene.gaussians):,} Gaussians, {len(scene.cameras)} views; {scene.frame.source}")
+        for remark in scene.remarks:
+            say(remark)
         return scene

@@ -7,16 +7,18 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
+from rich.console import Console
 
 from pgsd_nerfstudio.dynamics import scattered
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import RunOptions
-from pgsd_nerfstudio.scene.loading import load_scene
 from pgsd_nerfstudio.weather.making import make_weather
 from pgsd_nerfstudio.weather.options import SceneOptions
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
 from pgsd_nerfstudio.weather.stored import StoredWeatherError
 from pgsd_nerfstudio.weather.weather import Weather
+
+console = Console(stderr=True, highlight=False)
 
 
 def open_scene(options: RunOptions, device: torch.device | str) -> PreparedScene:
@@ -34,7 +36,9 @@ def open_scene(options: RunOptions, device: torch.device | str) -> PreparedScene
 
 @lru_cache(maxsize=2)
 def _opened(scene: SceneOptions, description: str | None, device: str, layers: int | None) -> PreparedScene:
-    loaded = load_scene(scene.load_scene, scene.data, metres_per_unit=scene.metres_per_unit, description=description)
+    loaded = scene.open(description)
+    for remark in loaded.remarks:
+        console.print(remark, style="dim", markup=False)
     return prepare_scene(loaded, device, layers)
 
 

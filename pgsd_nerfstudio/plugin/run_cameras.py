@@ -15,9 +15,14 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from pgsd_nerfstudio.plugin.places import found
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.captures.capture import Capture, checked_poses
+from pgsd_nerfstudio.scene.captures.lenses import lens_of
+from pgsd_nerfstudio.scene.captures.photographs import Photograph, find_photographs
+from pgsd_nerfstudio.scene.captures.transforms import DISTORTION
 from pgsd_nerfstudio.scene.run_config import Record, entry, read_run_config
 from pgsd_nerfstudio.scene.scene import SceneError
 
@@ -31,16 +36,18 @@ DATAPARSERS = {
         ("sitcoms3d", "Sitcoms3D"),
     )
 }
+LENSES = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: "OPENCV_FISHEYE"}
+"""COLMAP's names for nerfstudio's kinds of cameras; of the others no pinhole can stand for the photographs."""
 PLAIN = (bool, int, float, str, Path, type(None))
 
 
-def run_cameras(config_path: Path) -> tuple[Cameras, tuple[Path, ...]]:
+def run_cameras(config_path: Path) -> Capture:
     """Training views of a run, from its config.yml, as nerfstudio itself would place them.
 
     Nothing that the file names is imported or called but one of `DATAPARSERS`.
 
     Raises:
-        SceneError: the config cannot be read, its data has moved, or its cameras are not of the pinhole kind.
+        SceneError: the config cannot be read, its data has moved, or no pinhole can stand for its cameras.
     """
     manager = entry(read_run_config(config_path), "pipeline", "datamanager")
     record = entry(manager, "dataparser")
@@ -50,12 +57,12 @@ def run_cameras(config_path: Path) -> tuple[Cameras, tuple[Path, ...]]:
     saved = entry(manager, "data") or entry(record, "data")
     saved = Path(saved) if isinstance(saved, str) else saved
     if not isinstance(saved, Path):
-        raise SceneError(f"{config_path} does not say where its photographs lie: pass --data with their transforms.json")
+        raise SceneError(f"{config_path} does not say where its photographs lie: pass data= with their transforms.json")
     data = found(saved, config_path.resolve().parent)
     if data is None:
         raise SceneError(
             f"the photographs of {config_path} are no longer at {saved}, nor below a folder above the run: move them back, run "
-            "the command where the training was run, or pass --data with their transforms.json"
+            "the command where the training was run, or pass data= with their transforms.json"
         )
     config = _dataparser_config(config_path, record, data)
     try:
@@ -63,9 +70,29 @@ def run_cameras(config_path: Path) -> tuple[Cameras, tuple[Path, ...]]:
     except (Exception, SystemExit) as error:
         # Whatever a dataparser meets in files that are not as it wants them; one ends the process where it may not ask.
         raise SceneError(
-            f"the dataparser of {config_path} could not read {data} ({error!r}): pass --data with a transforms.json"
+            f"the dataparser of {config_path} could not read {data} ({error!r}): pass data= with a transforms.json"
         ) from error
-    return from_nerfstudio(outputs.cameras), tuple(Path(name) for name in outputs.image_filenames)
+    return _capture(config_path, outputs, data)
+
+
+def _capture(config_path: Path, outputs: DataparserOutputs, data: Path) -> Capture:
+    """What a dataparser found: poses, lenses, and where the photographs lie."""
+    cameras, names = outputs.cameras.reshape((-1,)), [str(name) for name in outputs.image_filenames]
+    kinds = [LENSES.get(int(kind), CameraType(int(kind)).name) for kind in cameras.camera_type.flatten()]
+    sides = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
+    numbers = torch.cat([side.double().reshape(-1, 1) for side in sides], dim=1).tolist()
+    bent = cameras.distortion_params
+    bends = [[]] * len(names) if bent is None else bent.double().reshape(len(names), -1).tolist()
+    lenses = []
+    for name, kind, (width, height, *focal), bend in zip(names, kinds, numbers, bends, strict=True):
+        values: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy", *DISTORTION), (*focal, *bend), strict=False))
+        lenses.append(lens_of(kind, width, height, values, f"{config_path}: the lens of {name}"))
+    masks = outputs.mask_filenames or [None] * len(names)
+    places = find_photographs(names, [data, data / "images"])
+    photographs = tuple(map(Photograph, places, lenses, masks))
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(names), 1, 1)
+    poses[:, :3] = cameras.camera_to_worlds.double()
+    return Capture(checked_poses(poses, names, config_path), photographs)
 
 
 def from_nerfstudio(cameras: NerfstudioCameras) -> Cameras:
@@ -110,7 +137,7 @@ def _dataparser_config(config_path: Path, record: Record, data: Path) -> Any:
     if record.python not in DATAPARSERS:
         raise SceneError(
             f"{config_path} asks for the dataparser {record.python}, which is not run for a file that may come from anybody: "
-            "pass --data with the transforms.json that it was trained on"
+            "pass data= with the transforms.json that it was trained on"
         )
     module, _, name = record.python.rpartition(".")
     kind = getattr(import_module(module), name)
@@ -118,7 +145,7 @@ def _dataparser_config(config_path: Path, record: Record, data: Path) -> Any:
     options = {name: value for name, value in record.items() if name in known}
     odd = [name for name, value in options.items() if not _plain(value)]
     if odd:
-        raise SceneError(f"{config_path}: {', '.join(odd)} of its dataparser must be plain values: pass --data instead")
+        raise SceneError(f"{config_path}: {', '.join(odd)} of its dataparser must be plain values: pass data= instead")
     if name == "ColmapDataParserConfig" and options.get("downscale_factor") is None:
         images = data / options.get("images_path", "images")
         # Asked for a size by nobody, it wants to make smaller photographs first; their cameras are the same.

@@ -5,13 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
+from pgsd_nerfstudio.rendering.choice import choose_rasterizer
+from pgsd_nerfstudio.scene.captures.lenses import pinhole
+from pgsd_nerfstudio.scene.captures.photographs import Photograph, read_photograph
 from pgsd_nerfstudio.scene.scene import Scene
 
 Picture = tuple[int, UInt8[Tensor, "h w 3"]]
@@ -24,8 +26,9 @@ def read_edited(folder: Path, scene: Scene) -> list[Picture]:
     """Read the edited pictures in a folder.
 
     A picture has the name of its photograph with any suffix (frame_00012.png for images/frame_00012.jpg). If the scene has no
-    photographs, the only number in the name is the index of the view. Pictures of another size are stretched to that of the
-    cameras. Pictures that belong to no view are left out, and a note tells so.
+    photographs, the only number in the name is the index of the view. Pictures are read as photographs are
+    (`captures.photographs.read_photograph`): in the size of the cameras, undistorted, and never stretched; where they show
+    nothing, the scene stays as it is. Pictures that belong to no view are left out, and a note tells so.
 
     Args:
         folder: holds the pictures.
@@ -64,8 +67,7 @@ def read_edited(folder: Path, scene: Scene) -> list[Picture]:
     if strangers:
         note = f"{len(strangers)} of the {len(files)} pictures in {folder} belong to no view, such as {strangers[0]}"
         console.print(f"[yellow]{note}[/]", soft_wrap=True)
-    size = (scene.cameras.width, scene.cameras.height)
-    return [(index, _read_picture(found[index], size)) for index in sorted(found)]
+    return [(index, _read_picture(found[index], scene, index)) for index in sorted(found)]
 
 
 def _view_of(stem: str, scene: Scene) -> int | None:
@@ -78,11 +80,13 @@ def _view_of(stem: str, scene: Scene) -> int | None:
     return same[0] if len(same) == 1 else None
 
 
-def _read_picture(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
-    try:
-        with Image.open(path) as stored:
-            picture = stored.convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"the edited picture {path} cannot be read ({error}): write it again as .png or .jpg") from error
-    resized = picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS)
-    return torch.from_numpy(np.array(resized))
+def _read_picture(path: Path, scene: Scene, index: int) -> UInt8[Tensor, "h w 3"]:
+    camera = scene.cameras[index]
+    lens = scene.photographs[index].lens if scene.photographs else pinhole(camera)
+    seen = read_photograph(Photograph(path, lens), camera)
+    rgb = seen.rgb
+    if not seen.known.all():
+        with torch.no_grad():
+            as_it_is = choose_rasterizer(scene.gaussians, "cpu").render(camera).rgb[0].clamp(0, 1)
+        rgb = torch.where(seen.known[..., None], rgb, as_it_is)
+    return (rgb * 255 + 0.5).byte()

@@ -7,7 +7,7 @@ Gaussians below them, and the scale from the height at which people hold a camer
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import roma
@@ -23,6 +23,8 @@ SNAP = 2.0  # degrees: an estimated up this close to +z is +z
 ORIENTED_WITHIN = 25.0  # degrees: if up cannot be estimated well, a +z this close to the cameras' mean up is trusted
 MIN_SPREAD = 0.05  # mean square of the horizontal axes across their main direction: views from an arc of 45 degrees
 CELLS = 32  # ground samples across the area inside the cameras' ring
+AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+"""Directions that have a name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,29 @@ def _converted(
     )
 
 
-def estimate_frame(cameras: Cameras, gaussians: Gaussians, metres_per_unit: float | None = None) -> Frame:
+def direction(up: str | Sequence[float]) -> tuple[float, float, float]:
+    """The direction that is meant by the name of an axis (x, -y and so on) or by three numbers; of length 1.
+
+    Raises:
+        ValueError: it is neither, or the numbers are zero or not finite.
+    """
+    try:
+        numbers = AXES[up] if isinstance(up, str) else tuple(float(value) for value in up)
+        x, y, z = numbers
+        length = math.hypot(x, y, z)
+        if not 0 < length < math.inf:
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"up must be one of {', '.join(AXES)}, or three numbers that are not all zero, got {up!r}") from error
+    return x / length, y / length, z / length
+
+
+def estimate_frame(
+    cameras: Cameras,
+    gaussians: Gaussians,
+    metres_per_unit: float | None = None,
+    up: tuple[float, float, float] | None = None,
+) -> Frame:
     """Estimate the metric frame of a capture.
 
     Up is perpendicular to the cameras' horizontal axes, or +z if that is nearly the same. The ground is taken as level.
@@ -117,27 +141,32 @@ def estimate_frame(cameras: Cameras, gaussians: Gaussians, metres_per_unit: floa
         gaussians: the frozen scene, in scene units.
         metres_per_unit: length of a scene unit. None: it is chosen so that the cameras' median height above the ground is
             1.5 m.
+        up: direction in scene axes, of any length. None: it is estimated from the way the cameras were held.
 
     Raises:
-        ValueError: there are no cameras, or `metres_per_unit` is not positive.
+        ValueError: there are no cameras, `metres_per_unit` is not positive, or `up` is no direction.
     """
     if len(cameras) == 0:
         raise ValueError("a frame needs at least one camera, found none")
-    up, up_source = _up(cameras)
+    if up is None:
+        upward, up_source = _up(cameras)
+    else:
+        upward = torch.tensor(direction(up), dtype=torch.float64)
+        up_source = f"up as given ({_numbers(upward)})"
     centers = cameras.centers.double()
     middle, radius = attention(cameras, gaussians)
-    camera_height = (centers @ up).median()
-    ground, ground_source = _ground(gaussians, up, middle, radius, camera_height)
+    camera_height = (centers @ upward).median()
+    ground, ground_source = ground_level(gaussians, upward, middle, radius, camera_height)
     height = float(camera_height - ground)
     if metres_per_unit is None:
         metres_per_unit = CAMERA_HEIGHT / height
         scale_source = f"scale from cameras taken as {CAMERA_HEIGHT} m above the ground"
     else:
         scale_source = f"scale as given, which puts the cameras {metres_per_unit * height:.2f} m above the ground"
-    origin = middle + (ground - middle @ up) * up
+    origin = middle + (ground - middle @ upward) * upward
     return Frame(
         float(metres_per_unit),
-        _rotation_to_z(up).float(),
+        rotation_to_z(upward).float(),
         origin.float(),
         f"{up_source}; {ground_source}; {scale_source}: 1 scene unit = {metres_per_unit:.4g} m",
     )
@@ -192,14 +221,14 @@ def attention(cameras: Cameras, gaussians: Gaussians) -> tuple[Float[Tensor, "3"
     return middle + 0.5 * reach * forward.mean(0), float(reach)
 
 
-def _ground(
+def ground_level(
     gaussians: Gaussians, up: Float[Tensor, "3"], middle: Float[Tensor, "3"], radius: float, camera_height: Float[Tensor, ""]
 ) -> tuple[Float[Tensor, ""], str]:
     """Height of the ground along `up`: the level on which most of the area inside the cameras' ring has its lowest Gaussians.
 
     Only opaque Gaussians count. The second value tells how the ground was found.
     """
-    axes = _rotation_to_z(up)
+    axes = rotation_to_z(up)
     local = (gaussians.means.double().cpu() - middle) @ axes.T
     heights = local[:, 2] + middle @ up
     opaque = (gaussians.opacities.cpu() > 0.5) & (gaussians.scales.cpu().amax(1) < 0.2 * radius)
@@ -225,7 +254,7 @@ def _ground(
     return level, f"ground from the lowest opaque Gaussians inside the cameras' ring ({share:.0%} of its area is level)"
 
 
-def _rotation_to_z(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def rotation_to_z(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The smallest rotation that takes `up` to +z."""
     z = torch.tensor([0.0, 0.0, 1.0], dtype=up.dtype)
     axis = torch.linalg.cross(up, z)

@@ -1,137 +1,145 @@
-"""Load a scene from a splatfacto run, its config.yml, a checkpoint, a 3DGS .ply, or the built-in demo."""
+"""Read a scene from a splatfacto run, its config.yml, a checkpoint, a splat of any format, or the built-in demo."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Literal
+
+import torch
 
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.capture import in_run, read_capture
-from pgsd_nerfstudio.scene.frame import estimate_frame
-from pgsd_nerfstudio.scene.scene import Scene, SceneError
-from pgsd_nerfstudio.scene.splats.checkpoint import read_checkpoint
-from pgsd_nerfstudio.scene.splats.ply import read_ply
+from pgsd_nerfstudio.scene.captures.capture import Capture
+from pgsd_nerfstudio.scene.errors import SceneError
+from pgsd_nerfstudio.scene.frame import Frame, direction, estimate_frame
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.level import upright
+from pgsd_nerfstudio.scene.orbit import VIEWS, orbit
+from pgsd_nerfstudio.scene.scene import Known, Scene
+from pgsd_nerfstudio.scene.source import check_source, source_of
+from pgsd_nerfstudio.scene.source_views import RunCameras, views_of
+from pgsd_nerfstudio.scene.splats.reading import read_splat
 
-RunCameras = Callable[[Path], tuple[Cameras, tuple[Path, ...]]]
-"""Function from the config.yml of a run to its cameras (in the coordinates of the splat) and photographs."""
+Up = str | tuple[float, float, float]
+"""The name of an axis (x, y, z, -x, -y, -z), or a direction in scene axes."""
 
 # Names of files and folders that do not describe the scene in them.
 NAMELESS = {"data", "pointcloud", "splat", "scene", "output", "outputs", "export", "exports", "images", "nerfstudio"}
+HIGH, LOW = 100.0, 0.1  # m: cameras that stand higher above the ground or lower are doubted
 
 
-def load_scene(
+def read_scene(
     path: str | Path,
     data: str | Path | None = None,
     *,
     metres_per_unit: float | None = None,
     description: str | None = None,
+    up: Up | None = None,
+    camera: Literal["orbit"] | None = None,
     run_cameras: RunCameras | None = None,
 ) -> Scene:
-    """Load a scene with its cameras and its metric frame.
+    """Read a scene with its cameras and its metric frame. Whether cameras and splat fit each other is not looked at here.
 
     Args:
-        path: "demo", a splatfacto run folder, its config.yml, a .ckpt of it, or a 3DGS .ply.
-        data: a transforms.json, its folder, or a splatfacto run. A .ply needs it: the .ply is taken to be in the coordinates of
-            the poses there, or in those of the run, as ns-export writes it. For a run it replaces the run's own data, and the
-            run's dataparser_transforms.json moves the poses.
-        metres_per_unit: length of a scene unit; None: it is estimated.
-        description: name of the scene in prompts ("a garden"); None: it is made from the name of the file.
+        path: what holds the splat; this and the next five as for `weather.loading.load_scene`.
+        data: what holds its cameras.
+        metres_per_unit: length of a scene unit.
+        description: name of the scene in prompts.
+        up: which way is up.
+        camera: "orbit" makes cameras.
         run_cameras: function that reads the cameras of a run with the run's own dataparser; None: the installed one (entry
             point group `pgsd_nerfstudio.run_cameras`), which imports nerfstudio only then.
 
     Raises:
         SceneError: the input cannot be used; the sentence says why and what to do.
+        TypeError: an argument is of another type.
     """
-    check_source(path, data, metres_per_unit)
+    check_source(path, data, metres_per_unit, up, camera)
+    known: Known = (metres_per_unit, None if up is None else direction(up))
     if str(path) == "demo":
-        return _demo(metres_per_unit, description)
-    path, data = Path(path).expanduser(), None if data is None else Path(data).expanduser()
-    if path.suffix.lower() == ".ply":
-        gaussians = read_ply(path)
-        cameras, images = _ply_cameras(path, data, run_cameras)
-        name = path.stem
+        return _demo(known, description)
+    source = source_of(Path(path).expanduser())
+    splat = read_splat(source.splat)
+    if camera == "orbit":
+        capture, (cameras, direction_up, remark) = None, _made(source.splat, splat.gaussians, known[1])
+        known, remarks = (metres_per_unit, direction_up), [remark]
     else:
-        checkpoint, run = _checkpoint(path)
-        gaussians = read_checkpoint(checkpoint)
-        cameras, images = _run_cameras(run, data, run_cameras)
-        name = run.parent.parent.name if run.parent.name == "splatfacto" else run.name
-    frame = estimate_frame(cameras, gaussians, metres_per_unit)
-    return Scene(name or "scene", gaussians, cameras, frame, images, description or _described(name))
+        capture, remarks = views_of(source, None if data is None else Path(data).expanduser(), run_cameras, splat.offset)
+        cameras = capture.cameras()
+        remarks += _missing(capture)
+    frame = _frame(source.splat, cameras, splat.gaussians, known)
+    return Scene(
+        source.name or "scene",
+        splat.gaussians,
+        cameras,
+        frame,
+        () if capture is None else capture.photographs,
+        description or _described(source.name),
+        offset=splat.offset,
+        placements=() if capture is None else capture.placements,
+        known=known,
+        remarks=(*remarks, *_doubts(cameras, frame, metres_per_unit)),
+    )
 
 
-def check_source(path: str | Path, data: str | Path | None, metres_per_unit: float | None) -> None:
-    """Refuse what `load_scene` can refuse without opening anything; its arguments have the same names.
-
-    Raises:
-        SceneError: there is no such scene or data, or the scale is not a positive number.
-    """
-    if metres_per_unit is not None and not 0 < metres_per_unit < math.inf:
-        raise SceneError(f"metres per scene unit must be a positive number, got {metres_per_unit:g}")
-    if str(path) != "demo" and not Path(path).expanduser().exists():
-        raise SceneError(f"no scene at {path}: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
-    if data is not None and not Path(data).expanduser().exists():
-        raise SceneError(f"no data at {data}: expected nerfstudio's transforms.json or its folder")
-
-
-def _demo(metres_per_unit: float | None, description: str | None) -> Scene:
+def _demo(known: Known, description: str | None) -> Scene:
     from pgsd_nerfstudio.scene.demo import demo_scene
 
     scene = demo_scene()
-    if metres_per_unit is not None:
-        frame = replace(scene.frame, metres_per_unit=metres_per_unit, source=f"{scene.frame.source}; scale as given")
+    if known[1] is not None:
+        scene = replace(scene, frame=estimate_frame(scene.cameras, scene.gaussians, *known))
+    elif known[0] is not None:
+        frame = replace(scene.frame, metres_per_unit=known[0], source=f"{scene.frame.source}; scale as given")
         scene = replace(scene, frame=frame)
-    return scene if description is None else replace(scene, description=description)
+    return replace(scene, description=description or scene.description, known=known)
 
 
-def _checkpoint(path: Path) -> tuple[Path, Path]:
-    """The newest checkpoint of a run folder, config.yml or .ckpt, and the run's folder."""
-    if path.suffix == ".ckpt":
-        return path, path.resolve().parent.parent
-    run = path.resolve() if path.is_dir() else path.resolve().parent
-    if path.is_file() and path.name != "config.yml":
-        raise SceneError(f"{path} is no scene: expected a splatfacto run folder, config.yml, .ckpt or .ply, or the word demo")
-    if run.parent.name == "pgsd-weather":
-        raise SceneError(
-            f"{path} is a run of pgsd-weather, which holds a weather and no scene: ns-viewer and ns-render show it; "
-            "for another weather pass the scene that it was trained on"
-        )
-    checkpoints = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))
-    if not checkpoints:
-        raise SceneError(f"{run} is no trained run: expected nerfstudio_models/step-*.ckpt in it, found none")
-    return checkpoints[-1], run
+def _made(
+    splat: Path, gaussians: Gaussians, up: tuple[float, float, float] | None
+) -> tuple[Cameras, tuple[float, float, float], str]:
+    """Cameras for a splat that has none, the direction that is up, and what is to be said."""
+    said = "up as given"
+    if up is None:
+        found = upright(gaussians)
+        if found is None:
+            raise SceneError(
+                f"no plane in {splat} stands out as the ground: pass up= too (x, y, z, -x, -y, -z or three numbers)"
+            )
+        up = direction(found.tolist())
+        said = f"up is across its largest plane ({', '.join(f'{value:.2f}' for value in up)}); if that is wrong, pass up="
+    cameras = orbit(gaussians, torch.tensor(up, dtype=torch.float64))
+    return (
+        cameras,
+        up,
+        f"there are no cameras: {VIEWS} are made on an orbit around the middle of the splat; {said}; its scale is a guess, so "
+        "pass metres_per_unit= if it is known",
+    )
 
 
-def _ply_cameras(path: Path, data: Path | None, run_cameras: RunCameras | None) -> tuple[Cameras, tuple[Path, ...]]:
-    if data is None:
-        raise SceneError(f"{path} holds no cameras: pass --data with the transforms.json that it was trained on")
-    config = data / "config.yml" if data.is_dir() else data
-    if config.name == "config.yml" and config.is_file() and not (data / "transforms.json").is_file():
-        return _run_cameras(config.resolve().parent, None, run_cameras)
-    return read_capture(data)
+def _frame(splat: Path, cameras: Cameras, gaussians: Gaussians, known: Known) -> Frame:
+    try:
+        return estimate_frame(cameras, gaussians, *known)
+    except (ValueError, RuntimeError) as error:  # a scale that is zero or infinite, a system that cannot be solved
+        raise SceneError(f"{splat} and its cameras give no metric frame ({error}): pass metres_per_unit= and up=") from error
 
 
-def _run_cameras(run: Path, data: Path | None, run_cameras: RunCameras | None) -> tuple[Cameras, tuple[Path, ...]]:
-    if data is not None:
-        cameras, images = read_capture(data)
-        return in_run(cameras, data, run / "dataparser_transforms.json"), images
-    config = run / "config.yml"
-    if not config.is_file():
-        raise SceneError(f"cameras are missing: there is no {config}; pass --data with the transforms.json it was trained on")
-    run_cameras = run_cameras or _installed_reader()
-    if run_cameras is None:
-        raise SceneError(f"only nerfstudio reads the cameras of {run}; pass --data with the transforms.json it was trained on")
-    cameras, images = run_cameras(config)
-    if len(cameras) == 0:
-        raise SceneError(f"{config} leads to data without cameras; pass --data with the transforms.json it was trained on")
-    return cameras, images
+def _missing(capture: Capture) -> list[str]:
+    """What is to be said of photographs that are not on disk."""
+    gone = [photograph.path for photograph in capture.photographs if not photograph.there]
+    if not gone:
+        return []
+    count = len(capture.photographs)
+    if len(gone) == count:
+        return [f"none of the {count} photographs is there, such as {gone[0]}: nothing is compared with them"]
+    return [f"{len(gone)} of the {count} photographs are missing, such as {gone[0]}"]
 
 
-def _installed_reader() -> RunCameras | None:
-    """What reads the cameras of a run; an entry point, so that this room does not know nerfstudio."""
-    return next((point.load() for point in entry_points(group="pgsd_nerfstudio.run_cameras")), None)
+def _doubts(cameras: Cameras, frame: Frame, metres_per_unit: float | None) -> list[str]:
+    """What is to be said of a given scale that puts the cameras where nobody stands."""
+    height = float(frame.to_metric(cameras.centers)[:, 2].median())
+    if metres_per_unit is None or LOW <= height <= HIGH:
+        return []
+    return [f"at {metres_per_unit:g} m per unit the cameras stand {height:.3g} m above the ground: is the scale right?"]
 
 
 def _described(name: str) -> str:
@@ -139,6 +147,3 @@ def _described(name: str) -> str:
     if not name.isalpha() or name.lower() in NAMELESS:
         return "a scene"
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name.lower()}"
-
-
-__all__ = ["RunCameras", "Scene", "SceneError", "load_scene"]

@@ -53,7 +53,7 @@ def read_run_config(path: Path) -> Record:
         if isinstance(error, SceneError):
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SceneError(f"{path} cannot be read as the config.yml of a run ({reason}): pass --data instead") from error
+        raise SceneError(f"{path} cannot be read as the config.yml of a run ({reason}): pass data= instead") from error
     if not isinstance(config, Record) or not config:
         raise SceneError(f"{path} is not the config.yml of a run: expected an object of nerfstudio, found something else")
     return config

@@ -7,6 +7,9 @@ and the options here decide what is simulated and name the file in the cache.
 from __future__ import annotations
 
 import importlib.util
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +18,7 @@ import tyro
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.physics.clock import Clock
+    from pgsd_nerfstudio.scene.scene import Scene
 
 FLAT = tyro.conf.arg(name="")
 """Marks a group of options whose flags carry no prefix."""
@@ -31,21 +35,52 @@ class SceneOptions:
     """Which scene, and what it measures."""
 
     load_scene: Path = tyro.MISSING
-    """The frozen scene: a splatfacto run folder, its config.yml, a .ckpt, a 3DGS .ply (with --data), or the word demo."""
+    """The frozen scene: a splatfacto run folder, its config.yml, a .ckpt, a splat (.ply, .spz and others), the output folder of
+    Inria's trainer, or the word demo."""
     data: Path | None = None
-    """Cameras and photographs of a .ply: nerfstudio's transforms.json or its folder. A run folder knows its own."""
+    """Cameras and photographs of a splat: nerfstudio's transforms.json, a COLMAP reconstruction, Inria's cameras.json, the
+    folder of one of them, or a run. A run folder knows its own."""
     metres_per_unit: float | None = None
     """Length of one scene unit in metres; by default such that the cameras were held 1.5 m above the ground."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | tuple[float, float, float] | None = None
+    """Which way is up in the scene's axes: the name of an axis or three numbers; by default from how the cameras were held."""
+    camera: Literal["orbit"] | None = None
+    """orbit makes cameras around the middle of a splat that has none."""
+    trust_cameras: tyro.conf.FlagConversionOff[bool] = False
+    """True: go on even if renders from the cameras do not look like their photographs."""
 
     def check(self) -> None:
         """Refuse what can be refused without opening the scene.
 
         Raises:
-            ValueError: there is no such scene or data, or the scale is not a positive number.
+            ValueError: there is no such scene or data, or an option cannot be what it is.
         """
-        from pgsd_nerfstudio.scene.loading import check_source
+        from pgsd_nerfstudio.scene.source import check_source
 
-        check_source(self.load_scene, self.data, self.metres_per_unit)
+        with _flags():
+            check_source(self.load_scene, self.data, self.metres_per_unit, self.up, self.camera)
+
+    def open(self, description: str | None = None) -> Scene:
+        """The scene.
+
+        Args:
+            description: name of the scene in prompts; None: it is made from the name of the file.
+
+        Raises:
+            SceneError: it cannot be used, or its cameras do not fit it.
+        """
+        from pgsd_nerfstudio.weather.loading import load_scene
+
+        with _flags():
+            return load_scene(
+                self.load_scene,
+                self.data,
+                metres_per_unit=self.metres_per_unit,
+                description=description,
+                up=self.up,
+                camera=self.camera,
+                trust_cameras=self.trust_cameras,
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +172,25 @@ class AnswerOptions:
         """
         if self.edited_images is not None and not self.edited_images.is_dir():
             raise ValueError(f"--edited-images must be a folder of edited training views, found none at {self.edited_images}")
+
+
+ARGUMENT = re.compile(r"(?<![\w./-])(data|metres_per_unit|up|camera|trust_cameras)=('(\w+)'|True)?")
+
+
+@contextmanager
+def _flags() -> Iterator[None]:
+    """Sentences that speak of arguments, as Python has them, speak of flags where a command was typed."""
+    from pgsd_nerfstudio.scene.errors import SceneError
+
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(ARGUMENT.sub(_flag, str(error))) from error
+
+
+def _flag(argument: re.Match[str]) -> str:
+    value = argument[3] or argument[2]
+    return f"--{argument[1].replace('_', '-')}" + (f" {value}" if value else "")
 
 
 def _has_cuda() -> bool:

@@ -9,6 +9,7 @@ import torch
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.weather.agreement import agreed
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class PreparedScene:
 
 
 def prepare_scene(scene: Scene, device: torch.device | str | None = None, layers: int | None = None) -> PreparedScene:
-    """Put a scene on a device.
+    """Put a scene on a device, and see that renders of it look like its photographs (`agreement.agreed`).
 
     Args:
         scene: as `load_scene` returns it.
@@ -33,6 +34,7 @@ def prepare_scene(scene: Scene, device: torch.device | str | None = None, layers
 
     Raises:
         ValueError: the device is neither cpu nor cuda or is not there, or layers are asked of another than the CPU's.
+        SceneError: the cameras do not fit the splat.
     """
     try:
         device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -43,4 +45,5 @@ def prepare_scene(scene: Scene, device: torch.device | str | None = None, layers
         raise ValueError(f"a scene is prepared on cpu or cuda, got {device}; {found}")
     frozen = scene.gaussians.to(device)
     exact = choose_rasterizer(frozen, device)
+    scene = agreed(scene, exact, device)
     return PreparedScene(scene, exact, exact if layers is None else choose_rasterizer(frozen, device, layers), device)
