@@ -1,7 +1,7 @@
 """The surface of a scene, on which particles land: a triangle mesh in metres with queries for rays and closest points.
 
-The mesh is fused (fusion.py) from the depth of the frozen Gaussians as the training cameras see it, so it works for any
-capture. Rays and closest points run in Open3D's RaycastingScene (Embree).
+The mesh is fused (fusion.py) from the depth of the frozen Gaussians as the training cameras see it (depth.py), so it works for
+any capture. Rays and closest points run in Open3D's RaycastingScene (Embree).
 """
 
 from __future__ import annotations
@@ -14,25 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
-from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import attention
-from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
+from pgsd_nerfstudio.surface.depth import SETTINGS, chosen_views, render_depths, without_sky
 from pgsd_nerfstudio.surface.fusion import Fusion, Region, fuse, open3d, without_silhouettes
 
-VERSION = 1  # of the fusion; cached meshes of another version are not read
-VIEWS = 40  # number of training cameras whose depth is fused, at most
-PIXELS = 512  # of the longer side of a depth image, at most
-HAZE, HARDENING = 0.1, 3.0  # see `solid`
+VERSION = 2  # of the fusion; cached meshes of another version are not read
 NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance from the cameras to what they look at
 NEAR = 1.25  # radius of the finely fused ball around what the cameras look at, in radii
+SKY = 1.25 * REACH  # distance from the nearest camera in radii beyond which a Gaussian is sky: nothing is fused there
 MAX_TRIANGLES = {"near": 330_000, "far": 70_000}
 
 Points = Float[Tensor | np.ndarray, "n 3"]
@@ -142,8 +137,9 @@ def surface_of(
 ) -> SurfaceMesh:
     """The surface of a scene, from the depth of its solid part as at most 40 of its training cameras see it.
 
-    The mesh is finer inside the ring of the cameras than beyond it and ends at four times their distance. It has at most
-    400,000 triangles; voxels grow until it does. It is kept in the cache under the hash of the scene and of these settings.
+    The mesh is finer inside the ring of the cameras than beyond it and ends at four times their distance. A sky beyond
+    that, at five times their distance or more, does not change it. It has at most 400,000 triangles; voxels grow until it does.
+    It is kept in the cache under the hash of the scene and of these settings.
 
     Args:
         scene: the frozen scene with its training cameras.
@@ -157,18 +153,20 @@ def surface_of(
         ValueError: `voxel` is not positive.
         OSError: the cache could not be written.
     """
-    middle, radius = attention(scene.cameras, scene.gaussians)
-    radius *= scene.frame.metres_per_unit
+    metres = scene.frame.metres_per_unit
+    middle, radius_units = attention(scene.cameras, scene.gaussians)
+    radius = radius_units * metres
     voxel = NEAR_VOXEL * radius if voxel is None else voxel
     if not voxel > 0:
         raise ValueError(f"the voxel of the surface must be a positive number of metres, got {voxel}")
     fusion = Fusion(voxel=voxel, reach=REACH * radius)
-    settings = (VERSION, VIEWS, PIXELS, HAZE, HARDENING, NEAR, FAR_VOXEL / NEAR_VOXEL, MAX_TRIANGLES, fusion)
+    settings = (VERSION, *SETTINGS, SKY, NEAR, FAR_VOXEL / NEAR_VOXEL, MAX_TRIANGLES, fusion)
     path = cache_dir() / "surfaces" / f"{content_key(scene.content_key(), *settings)}.safetensors"
     if cache and (mesh := _stored(path)) is not None:
         return mesh
-    cameras = _views(scene.cameras)
-    depths = _render_depths(scene, rasterizer.frozen.device, cameras, progress)
+    cameras = chosen_views(scene.cameras)
+    ground = without_sky(scene.gaussians, cameras, SKY * radius_units)
+    depths = [metres * depth for depth in render_depths(ground, cameras, rasterizer.frozen.device, progress=progress)]
     center = scene.frame.to_metric(middle.float())
     mesh = surface_from_depths(depths, scene.frame.cameras_to_metric(cameras), center, radius, voxel)
     if cache:
@@ -198,21 +196,6 @@ def surface_from_depths(
     )
 
 
-def solid(gaussians: Gaussians) -> Gaussians:
-    """The solid part of a scene, from which its depth is rendered; all colours are zero.
-
-    The expected depth of a trained splat lies behind a surface through which a little light leaks, and in front of a surface
-    whose reflections faint haze imitates. Gaussians below an opacity of 0.1 are therefore left out and the others hardened to
-    1 - (1 - opacity)^3 (three of each), so that light stops at the first surface: on a garden table the spread of depth fell
-    from 2.8 to 1.1 cm, and the mesh within 5 cm of it grew from 66 to 90 percent of the pixels. The price is that surfaces lie
-    up to a standard deviation of their Gaussians too far out (measured there: 0.5 cm on the table, 2 to 3 cm on the ground).
-    More hardening raises that error, less leaves holes.
-    """
-    kept = gaussians.select(gaussians.opacities > HAZE)
-    plain = torch.zeros_like(kept.means)
-    return replace(kept, opacities=1 - (1 - kept.opacities) ** HARDENING, colors=plain)
-
-
 def _stored(path: Any) -> SurfaceMesh | None:
     """The mesh of a cache file; None if there is no file, or if it holds no such mesh."""
     found = load_tensors(path)
@@ -221,26 +204,6 @@ def _stored(path: Any) -> SurfaceMesh | None:
     vertices, triangles = found[0]["vertices"], found[0]["triangles"]
     sound = torch.isfinite(vertices).all() and (len(triangles) == 0 or int(triangles.max()) < len(vertices))
     return SurfaceMesh(vertices, triangles) if sound else None
-
-
-def _views(cameras: Cameras) -> Cameras:
-    """An even choice of the training cameras, small enough for depth."""
-    chosen = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long()
-    zoom = min(1.0, PIXELS / max(cameras.width, cameras.height))
-    return cameras[chosen].resized(round(cameras.width * zoom), round(cameras.height * zoom))
-
-
-@torch.no_grad()
-def _render_depths(scene: Scene, device: torch.device, cameras: Cameras, progress: bool) -> list[Float[Tensor, "h w"]]:
-    """Depth in metres; 0 where the solid part is half transparent, inf where it is absent and the sky shows."""
-    rasterizer, depths = choose_rasterizer(solid(scene.gaussians), device), []
-    shown = {"console": Console(stderr=True), "disable": not progress, "transient": True}
-    for index in track(range(len(cameras)), "Surface: depth of the training views", **shown):
-        seen = rasterizer.render(cameras[index].to(device))
-        depth, accumulation = seen.depth[0].cpu() * scene.frame.metres_per_unit, seen.accumulation[0].cpu()
-        depth = torch.where(accumulation > 0.5, depth, 0.0)
-        depths.append(torch.where(accumulation < 0.1, torch.inf, depth))
-    return depths
 
 
 def _fuse_within(
