@@ -154,3 +154,26 @@ def test_an_nvidia_driver_is_looked_for_by_its_device_and_its_program():
     source = f'source <(sed -n "/^has_gpu/p" {ROOT}/scripts/environment); has_gpu'
     done = subprocess.run(["bash", "-c", source], env=os.environ)
     assert (done.returncode == 0) == has_nvidia()
+
+
+@pytest.mark.parametrize(
+    ("told", "given", "index"),
+    [
+        ("global.index-url='https://mirror.example/simple'", {}, "https://mirror.example/simple"),
+        ("global.index-url='https://a.example'\n:env:.index-url='https://b.example'", {}, "https://b.example"),
+        ("global.index-url='https://a.example'\ninstall.index-url='https://c.example'", {}, "https://c.example"),
+        ("global.index-url='https://a.example'", {"UV_DEFAULT_INDEX": "https://d.example"}, "https://d.example"),
+        ("global.timeout='60'", {}, ""),
+        ("", {}, ""),
+    ],
+)
+def test_a_mirror_that_pip_was_told_of_is_told_to_uv(tmp_path: Path, told: str, given: dict[str, str], index: str):
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text(f'#!/bin/sh\ntest "$*" = "-m pip config list" && cat <<END\n{told}\nEND\n')
+    python.chmod(0o755)
+    function = f'source <(sed -n "/^as_pip_is_told/,/^}}/p" {ROOT}/scripts/environment)'
+    program = f'set -euo pipefail; VENV={tmp_path}; {function}; as_pip_is_told; echo "${{UV_DEFAULT_INDEX:-}} $UV_SYSTEM_CERTS"'
+    environment = {"PATH": os.environ["PATH"], **given}
+    done = subprocess.run(["bash", "-c", program], env=environment, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == (f"{index} true\n", "")
