@@ -17,6 +17,7 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.scene import Scene
+from pgsd_nerfstudio.surface.fusion import Fusion, fuse
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_from_depths, surface_of
 from pgsd_nerfstudio.weather.loading import load_scene
 
@@ -153,6 +154,16 @@ def test_nothing_seen_is_an_empty_surface_that_nothing_hits():
     assert torch.isinf(mesh.cast(points, -torch.ones(4, 3)).distance).all()
     found = mesh.closest(points)
     assert torch.isinf(found.distance).all() and torch.equal(found.points, points)
+
+
+@pytest.mark.parametrize("pixel", [(1, 2), (16, 16)])
+def test_a_few_pixels_of_something_are_a_surface_or_none_but_no_error(pixel):
+    cameras = round_of(3, 2.5, 1.6, size=32)
+    depths = [torch.full((32, 32), torch.inf) for _ in range(3)]
+    for depth in depths:
+        depth[pixel] = 2.0
+    fused = fuse(depths, cameras, Fusion(voxel=VOXEL, reach=10.0))
+    assert len(fused[1]) == 0  # one pixel is a crumb
 
 
 def floor_scene() -> Scene:

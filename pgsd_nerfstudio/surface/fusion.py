@@ -73,20 +73,34 @@ def fuse(
         touched = _image(torch.where(depth < fusion.reach, depth, 0.0))
         camera = (core.Tensor(K.double().cpu().numpy()), core.Tensor(viewmat.double().cpu().numpy()))
         views.append((_image(depth.clamp(max=FAR_AWAY)), camera))
-        if touched.as_tensor().numpy().any():
-            blocks = grid.compute_unique_block_coordinates(touched, *camera, 1.0, fusion.reach, fusion.truncation)
+        # Only every fourth pixel of a row and of a column is looked at, so an image with depth may touch nothing.
+        blocks = _or_nothing(
+            lambda: grid.compute_unique_block_coordinates(touched, *camera, 1.0, fusion.reach, fusion.truncation),
+            "No block is touched",
+        )
+        if blocks is not None:
             _activate(grid, blocks, fusion.voxel * BLOCK, region)
     if grid.hashmap().size() == 0:
         return _nothing()
     blocks = grid.hashmap().key_tensor()[grid.hashmap().active_buf_indices().to(core.int64)]
     for image, camera in views:
         grid.integrate(blocks, image, *camera, 1.0, 2 * FAR_AWAY, fusion.truncation)
-    mesh = grid.extract_triangle_mesh(0.5)
-    if mesh.is_empty() or "indices" not in mesh.triangle:
+    mesh = _or_nothing(lambda: grid.extract_triangle_mesh(0.5), "SetVertexColors")  # of which a grid without a surface has none
+    if mesh is None or mesh.is_empty() or "indices" not in mesh.triangle:
         return _nothing()
     vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32)
     triangles = triangles[region(vertices[triangles].mean(1)) < 0]
     return _without_crumbs(vertices, triangles, fusion.min_component * fusion.voxel)
+
+
+def _or_nothing(find: Callable[[], Any], complaint: str) -> Any:
+    """What Open3D finds; None where it raises an error with these words because there is nothing to find."""
+    try:
+        return find()
+    except RuntimeError as error:
+        if complaint not in str(error):
+            raise
+        return None
 
 
 def _activate(grid: Any, blocks: Any, edge: float, region: Region) -> None:
