@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,10 +75,8 @@ def fuse(
         camera = (core.Tensor(K.double().cpu().numpy()), core.Tensor(viewmat.double().cpu().numpy()))
         views.append((_image(depth.clamp(max=FAR_AWAY)), camera))
         # Only every fourth pixel of a row and of a column is looked at, so an image with depth may touch nothing.
-        blocks = _or_nothing(
-            lambda: grid.compute_unique_block_coordinates(touched, *camera, 1.0, fusion.reach, fusion.truncation),
-            "No block is touched",
-        )
+        find = partial(grid.compute_unique_block_coordinates, touched, *camera, 1.0, fusion.reach, fusion.truncation)
+        blocks = _or_nothing(find, "No block is touched")
         if blocks is not None:
             _activate(grid, blocks, fusion.voxel * BLOCK, region)
     if grid.hashmap().size() == 0:
@@ -85,7 +84,7 @@ def fuse(
     blocks = grid.hashmap().key_tensor()[grid.hashmap().active_buf_indices().to(core.int64)]
     for image, camera in views:
         grid.integrate(blocks, image, *camera, 1.0, 2 * FAR_AWAY, fusion.truncation)
-    mesh = _or_nothing(lambda: grid.extract_triangle_mesh(0.5), "SetVertexColors")  # of which a grid without a surface has none
+    mesh = _or_nothing(partial(grid.extract_triangle_mesh, 0.5), "SetVertexColors")  # a grid without a surface has none
     if mesh is None or mesh.is_empty() or "indices" not in mesh.triangle:
         return _nothing()
     vertices, triangles = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32)
