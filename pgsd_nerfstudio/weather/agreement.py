@@ -1,8 +1,8 @@
 """Whether a splat and its cameras are in the same coordinates: renders of some views look like their photographs.
 
 Files do not say in which coordinates a splat is, and a splat in other ones than its cameras gives a smear and no error. So a
-few small renders are compared with the photographs, and where they do not agree the cameras are tried at the places where splats
-of such a capture are found (`scene.captures.placements`).
+few small renders are compared with the photographs, and where they do not agree the cameras are tried at the places where
+splats of such a capture are found (`scene.captures.placements`).
 
 The measure is a correlation of grey values between two blurs, which exposure, white balance and missing backgrounds do not
 touch. On a photographed garden its median over views is 0.92 with the right cameras, 0.75 with cameras turned by 2 degrees, and
@@ -146,7 +146,11 @@ def _detail(grey: Float[Tensor, "h w"], weight: Float[Tensor, "h w"]) -> Float[T
 
 def _blurred(picture: Float[Tensor, "h w"], sigma: float) -> Float[Tensor, "h w"]:
     """Convolved with a Gaussian; beyond its edges the picture is zero."""
-    radius = max(1, round(3 * sigma))
-    kernel = torch.exp(-torch.arange(-radius, radius + 1).float().square() / (2 * sigma**2))
-    rows = torch.nn.functional.conv2d(picture[None, None], kernel[None, None, :, None], padding=(radius, 0))
-    return torch.nn.functional.conv2d(rows, kernel[None, None, None, :], padding=(0, radius))[0, 0] / kernel.sum() ** 2
+    down, across = (_kernel(side, sigma) for side in picture.shape)
+    return down @ picture @ across
+
+
+def _kernel(side: int, sigma: float) -> Float[Tensor, "n n"]:
+    """The convolution along one side as a matrix, which is its own transpose."""
+    away = torch.arange(side)[:, None] - torch.arange(side)
+    return torch.exp(-away.float().square() / (2 * sigma**2)) / (sigma * (2 * torch.pi) ** 0.5)
