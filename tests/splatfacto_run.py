@@ -15,7 +15,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.scene.splats.ply import read_ply
+from pgsd_nerfstudio.scene.splats.reading import read_splat
 
 STEP = 29_999
 
@@ -28,7 +28,7 @@ def write_splatfacto_run(outputs: Path, ply: Path, data: Path) -> Path:
     config = copy.deepcopy(method_configs["splatfacto"])
     config.output_dir, config.experiment_name, config.timestamp = outputs, data.name, "2024-01-01_000000"
     config.data = config.pipeline.datamanager.data = data
-    gaussians = read_ply(ply)
+    gaussians = read_splat(ply).gaussians
     config.pipeline.model.sh_degree = gaussians.sh_degree
     run = config.get_base_dir()
     run.mkdir(parents=True)
