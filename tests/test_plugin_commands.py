@@ -89,9 +89,9 @@ def test_eval_and_export_end_well(run: Path):
     assert 0 <= results["drift_m"] < 0.1 and results["changed_by_weather"] > 0
     succeed(run, "ns-export", "gaussian-splat", "--load-config", CONFIG, "--output-dir", "export")
 
-    from pgsd_nerfstudio.scene.splats.ply import read_ply
+    from pgsd_nerfstudio.scene.splats.reading import read_splat
 
-    assert len(read_ply(run / "export/splat.ply")) > 80_000
+    assert len(read_splat(run / "export/splat.ply").gaussians) > 80_000
 
 
 def test_bad_input_is_a_sentence_and_no_traceback(run: Path):
