@@ -33,9 +33,11 @@ def decompressed(ply: PlyFile) -> Gaussians:
     vertex, chunk = ply.element("vertex"), ply.element("chunk")
     if vertex is None or chunk is None:
         raise unreadable(ply.path, "its packed vertices have no chunks")
-    missing = [n for n in PACKED if vertex.columns.get(n) != "u4"] + [
-        n for n in (*CENTRES[0], *CENTRES[1], *SCALES[0], *SCALES[1]) if n not in chunk.columns
-    ]
+    # The first files had no bounds of colours.
+    colored = any(name in chunk.columns for side in COLOURS for name in side)
+    bounding = [name for names in (CENTRES, SCALES, *([COLOURS] if colored else [])) for side in names for name in side]
+    missing = [name for name in PACKED if vertex.columns.get(name) != "u4"]
+    missing += [name for name in bounding if name not in chunk.columns]
     if missing:
         raise unreadable(ply.path, f"of a compressed .ply it lacks {', '.join(missing)}")
     if chunk.count != -(-vertex.count // CHUNK):
@@ -50,7 +52,7 @@ def decompressed(ply: PlyFile) -> Gaussians:
         return low * (1 - part) + high * part
 
     color = np.stack([_part(packed["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
-    rgb = within(COLOURS, color[:, :3]) if "min_r" in chunk.columns else color[:, :3]
+    rgb = within(COLOURS, color[:, :3]) if colored else color[:, :3]
     return Gaussians(
         torch.from_numpy(within(CENTRES, _three(packed["packed_position"]))),
         torch.from_numpy(_rotations(packed["packed_rotation"])),
