@@ -1,12 +1,14 @@
 """Trajectories, times and pictures that the data manager serves."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
 from plugin_scene import HEIGHT, VIEWS, WIDTH, grouped, write_scene
 
-from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig, partners
+from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig, partners, path_views
+from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.storage import cache_dir
 
@@ -54,9 +56,35 @@ def test_partners_are_the_nearest_views_and_never_the_view_itself(manager: Traje
 
 
 def test_views_have_times_over_the_whole_weather(manager: TrajectoryDataManager):
-    times = manager.eval_dataset.cameras.times
-    assert manager.includes_time and times is not None and times.shape == (VIEWS, 1)
-    assert (float(times[0]), float(times[-1])) == (0.0, 1.0)
+    for dataset, count in ((manager.train_dataset, VIEWS), (manager.eval_dataset, round(2.4 * 0.8))):
+        times = dataset.cameras.times
+        assert manager.includes_time and times is not None and times.shape == (count, 1)
+        assert (float(times[0]), float(times[-1])) == (0.0, 1.0)
+    assert len(manager.fixed_indices_eval_dataloader) == VIEWS
+
+
+@pytest.mark.parametrize(("count", "seconds"), [(40, 10.0), (12, 10.0), (6, 4.0), (1, 2.0), (300, 60.0), (40, 0.1)])
+def test_interpolating_between_evaluation_views_takes_as_long_as_the_weather(count: int, seconds: float):
+    """As nerfstudio's RenderInterpolated counts: 10 steps a transition, 24 frames per second over all views."""
+    views = path_views(count, seconds)
+    duration = 10 * len(views) / 24
+    assert abs(duration - seconds) <= 10 / 24 / 2 or len(views) == 2
+    assert set(views) <= set(range(count)) and views[0] == 0
+    if count < len(views):
+        assert all(abs(after - before) <= 1 for before, after in pairwise(views)), "back and forth, without a jump"
+    else:
+        assert views == sorted(set(views)) and views[-1] == count - 1
+
+
+def test_smaller_views_are_asked_for_by_a_factor(manager: TrajectoryDataManager):
+    config = TrajectoryDataManagerConfig(options=manager.config.options)
+    config.dataparser.downscale_factor = 2.0  # as ns-render dataset --downscale-factor 2 sets it
+    smaller = config.setup().train_dataset
+    assert smaller[0]["image"].shape == (HEIGHT // 2, WIDTH // 2, 3)
+    torch.testing.assert_close(smaller.cameras.fx, manager.train_dataset.cameras.fx / 2)
+    config.dataparser.downscale_factor = -1.0
+    with pytest.raises(RunError, match="--downscale-factor must be positive, got -1"):
+        config.setup()
 
 
 def test_missing_photographs_are_rendered_once_and_kept(manager: TrajectoryDataManager, monkeypatch: pytest.MonkeyPatch):

@@ -6,6 +6,7 @@ the flags are copied into all three as soon as they are parsed.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,11 +22,14 @@ from rich.console import Console
 from pgsd_nerfstudio.plugin.environment import prepare
 from pgsd_nerfstudio.plugin.options import RunOptions, check_version
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipelineConfig
+from pgsd_nerfstudio.plugin.resuming import resumed
 from pgsd_nerfstudio.plugin.trainer import WeatherTrainer
 from pgsd_nerfstudio.plugin.training_options import CUDA
 from pgsd_nerfstudio.weather.options import FLAT
 
 prepare()
+
+THIS_MACHINE = "127.0.0.1"
 
 
 @dataclass
@@ -42,8 +46,11 @@ class WeatherTrainerConfig(TrainerConfig):
     """Machine configuration."""
     logging: LoggingConfig = field(default_factory=lambda: LoggingConfig(steps_per_log=1))
     """Logging configuration; every step is logged, since a step takes seconds."""
-    viewer: ViewerConfig = field(default_factory=lambda: ViewerConfig(quit_on_train_completion=True))
-    """Viewer configuration; training ends by itself also with a viewer."""
+    viewer: ViewerConfig = field(
+        default_factory=lambda: ViewerConfig(quit_on_train_completion=True, websocket_host=THIS_MACHINE)
+    )
+    """Viewer configuration; training ends by itself also with a viewer, which only this machine can reach unless
+    --viewer.websocket-host says otherwise."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "wandb", "viewer+wandb", "comet", "viewer+comet"] = (
         "tensorboard"
     )
@@ -72,6 +79,13 @@ class WeatherTrainerConfig(TrainerConfig):
         self.run = replace(run.with_words_understood(), training_seed=self.machine.seed)
         if self.experiment_name is None:
             self.experiment_name = run.scene.load_scene.stem
+        going_on = resumed(self.run, self.load_dir, self.load_step, self.load_checkpoint)
+        if going_on is not None:
+            for remark in going_on.remarks:
+                _say(remark)
+            if self.load_dir is not None:
+                self.load_step = going_on.step  # asked for the newest, nerfstudio stumbles over other files in the folder
+            self.pipeline.resumed_folder = going_on.run_folder
         self.max_num_iterations = run.training_steps
         self.optimizers = {
             group: {
@@ -89,17 +103,55 @@ class WeatherTrainerConfig(TrainerConfig):
             _say(remark)
 
     def save_config(self) -> None:
-        """As nerfstudio, but the pipeline is told first where the run lies."""
+        """Nothing is written yet, since a run that is refused leaves no folder; the trainer writes it when the run is ready.
+        The pipeline is told where the run will lie."""
         self.pipeline.run_folder = self.get_base_dir().resolve()
+
+    def write_config(self) -> None:
+        """Write config.yml, with all defaults that have been settled."""
         super().save_config()
+
+    def get_base_dir(self) -> Path:
+        """The folder of the run: where its config.yml was opened, wherever it was written."""
+        return self.__dict__.get("_opened_in") or super().get_base_dir()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What config.yml holds: not where it was opened."""
+        return {name: value for name, value in self.__dict__.items() if name != "_opened_in"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Called when a config.yml is read: other versions are refused, a run that was moved is found where it is now."""
         # Of what the file says: a class knows a version of its own.
         check_version(vars(state["run"]).get("version") if "run" in state else None)
         self.__dict__.update(state)
+        opened = _config_being_opened()
+        if opened is not None:
+            self.__dict__["_opened_in"] = opened.resolve().parent
         if self.run.scene.load_scene is not tyro.MISSING:
+            self.pipeline.datamanager.made_in = self.pipeline.run_folder
             self.pipeline.run_folder = self.get_base_dir().resolve()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """ns-viewer puts a viewer configuration of its own in place of the run's, by which anybody in the network can connect:
+        unless its flag names an address, that of the run stays."""
+        given = self.__dict__.get("viewer") if name == "viewer" else None
+        if given is not None and value.websocket_host == ViewerConfig().websocket_host and not _names_host(sys.argv):
+            value = replace(value, websocket_host=given.websocket_host)
+        super().__setattr__(name, value)
+
+
+def _config_being_opened() -> Path | None:
+    """The config.yml that nerfstudio's eval_setup is reading. It hands on the text alone, and not where it comes from."""
+    frame = sys._getframe()
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "nerfstudio.utils.eval_utils" and frame.f_code.co_name == "eval_setup":
+            return Path(frame.f_locals["config_path"])
+        frame = frame.f_back
+    return None
+
+
+def _names_host(arguments: list[str]) -> bool:
+    return any(word.replace("_", "-").split("=")[0] == "--viewer.websocket-host" for word in arguments)
 
 
 def _say(line: str) -> None:

@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from torch import Tensor
 
+from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.opening import open_scene
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
@@ -23,7 +24,17 @@ from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 
 OTHER = 1_000_003  # added to the seed, gives trajectories that training does not see
 NEAREST = 6  # views to which a trajectory may lead
-EVAL_VIEWS = 12  # as many, evenly chosen, are measured and form the path of `ns-render interpolate`
+EVAL_VIEWS = 12  # as many, evenly chosen, are measured
+# `ns-render interpolate` makes 10 pictures from each evaluation view to the next, and its video lasts 10/24 s for each view.
+STEPS, FRAME_RATE = 10, 24
+
+
+@dataclass
+class ViewsConfig(DataParserConfig):
+    """The little that ns-render dataset asks of a dataparser's configuration."""
+
+    downscale_factor: float | None = None
+    """Factor by which pictures are smaller than those of the scene's cameras."""
 
 
 @dataclass
@@ -31,9 +42,11 @@ class TrajectoryDataManagerConfig(VanillaDataManagerConfig):
     """Vanilla by type, since ns-render spiral and dataset ask for that."""
 
     _target: type = field(default_factory=lambda: TrajectoryDataManager)
-    dataparser: tyro.conf.Suppress[Any] = field(default_factory=DataParserConfig)
+    dataparser: tyro.conf.Suppress[Any] = field(default_factory=ViewsConfig)
     options: tyro.conf.Suppress[RunOptions] = field(default_factory=RunOptions.unset)
     run_folder: tyro.conf.Suppress[Path | None] = None
+    made_in: tyro.conf.Suppress[Path | None] = None
+    """Where the run's folder was when it was made."""
 
 
 class TrajectoryDataManager(VanillaDataManager):
@@ -60,15 +73,18 @@ class TrajectoryDataManager(VanillaDataManager):
         self.config, self.device, self.test_mode = config, device, test_mode
         self.world_size, self.local_rank = world_size, local_rank
         self.includes_time = True
-        self.prepared = open_scene(config.options, device)
-        count = len(self.prepared.scene.cameras)
-        self.train_dataset = Views(self.prepared, list(range(count)))
-        chosen = torch.linspace(0, count - 1, min(EVAL_VIEWS, count)).round().long()
-        self.eval_dataset = Views(self.prepared, chosen.tolist())
+        self.prepared = open_scene(config.options, device, config.run_folder, config.made_in)
+        count, smaller = len(self.prepared.scene.cameras), config.dataparser.downscale_factor or 1.0
+        if not 0 < smaller < float("inf"):
+            raise RunError(f"--downscale-factor must be positive, got {smaller:g}")
+        self.train_dataset = Views(self.prepared, list(range(count)), smaller)
+        self.eval_dataset = Views(self.prepared, path_views(count, config.options.simulation.seconds), smaller)
         self.train_dataparser_outputs = self.train_dataset._dataparser_outputs
         DataManager.__init__(self)
-        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(input_dataset=self.eval_dataset, device=device)
-        self.eval_dataloader = FixedIndicesEvalDataloader(input_dataset=self.eval_dataset, device=device)
+        chosen = torch.linspace(0, count - 1, min(EVAL_VIEWS, count)).round().long()
+        evaluated = Views(self.prepared, chosen.tolist(), smaller)
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(input_dataset=evaluated, device=device)
+        self.eval_dataloader = FixedIndicesEvalDataloader(input_dataset=evaluated, device=device)
 
     def setup_train(self) -> None:
         """Nothing to load: trajectories are made when they are asked for."""
@@ -86,7 +102,7 @@ class TrajectoryDataManager(VanillaDataManager):
 
     def next_eval_image(self, step: int) -> tuple[NerfstudioCameras, dict[str, Any]]:
         """One evaluation view with its picture, in turn."""
-        return self.eval_dataloader.get_camera(step % len(self.eval_dataset))
+        return self.eval_dataloader.get_camera(step % len(self.eval_dataloader.input_dataset))
 
     def _trajectory(self, step: int, seed: int) -> tuple[NerfstudioCameras, dict[str, Any]]:
         options, views = self.config.options, self.prepared.scene.cameras
@@ -115,6 +131,21 @@ class TrajectoryDataManager(VanillaDataManager):
     def get_datapath(self) -> Path:
         """Where the viewer keeps camera paths: with the run, since the scene may lie where nobody may write."""
         return self.config.run_folder or Path()
+
+
+def path_views(count: int, seconds: float) -> list[int]:
+    """Views along which `ns-render interpolate` takes as long as the weather lasts, in the order of the capture.
+
+    Args:
+        count: number of training views. Where they are too few, the path leads back and forth.
+        seconds: length of the weather.
+    """
+    wanted = max(2, round(seconds * FRAME_RATE / STEPS))
+    if wanted <= count:
+        return torch.linspace(0, count - 1, wanted).round().long().tolist()
+    there = list(range(count))
+    round_trip = there + there[-2:0:-1]
+    return [round_trip[index % len(round_trip)] for index in range(wanted)]
 
 
 def partners(views: Cameras, first: int, nearest: int | None) -> Int[Tensor, " n"]:

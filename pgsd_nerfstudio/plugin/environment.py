@@ -14,11 +14,12 @@ from types import TracebackType
 import numpy as np
 import torch
 
+from pgsd_nerfstudio.refusal import Refusal
 from pgsd_nerfstudio.scene.scene import SceneError
 from pgsd_nerfstudio.storage import cache_dir
 
 
-class RunError(ValueError):
+class RunError(Refusal):
     """A run that cannot be trained or opened, in one sentence: what was expected, what was found and what to do."""
 
 
@@ -64,10 +65,13 @@ def _show_sentences() -> None:
         return
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, SceneError | RunError) and not os.environ.get("PGSD_TRACEBACK"):
-            print(f"pgsd-weather: {error}", file=sys.stderr)
-        else:
+        from pgsd_nerfstudio.plugin.known_errors import explained
+
+        sentence = str(error) if isinstance(error, SceneError | RunError) else explained(error, traceback)
+        if sentence is None or os.environ.get("PGSD_TRACEBACK"):
             shown_before(kind, error, traceback)
+        else:
+            print(f"pgsd-weather: {sentence}", file=sys.stderr)
 
     show.shows_sentences = True  # type: ignore[attr-defined]
     sys.excepthook = show

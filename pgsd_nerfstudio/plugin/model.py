@@ -1,8 +1,7 @@
 """The model nerfstudio sees: the frozen scene with the weather of any moment in it.
 
-Which moment: cameras with times (viewer, camera paths with render_time, spiral, dataset) show times 0..1 over the whole
-weather, the nearest frame. Cameras without (ns-render interpolate never has any): each render shows the next frame, so that a
-video of 25 frames per second plays in real time, and starts over after the last.
+Which moment a camera sees is said in `plugin.moments`. Pictures along a path have even sizes, since videos of odd ones are
+written in a way (4:4:4) that few players show.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from rich.console import Console
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -25,6 +25,7 @@ from pgsd_nerfstudio.dynamics import Deformation, DeformedCloud, DynamicsField, 
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.moments import Moments, place_in_path
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
@@ -34,9 +35,12 @@ from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.response.answer import Answer, Shown, baked
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.storage import content_key
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
 from pgsd_nerfstudio.weather.weather import Weather
 
+DIGEST = "digest"
+MOST_PIXELS = 2**26  # 8192 x 8192: more than any video format takes
 BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
 STRIDE = 8  # frames between kept states: a jump in time, and what lies in a training clip, costs 3.5 frames on average
 
@@ -90,7 +94,7 @@ class WeatherModel(SplatfactoModel):
         self.weather = Panel(self.prepared.scene, self.config.options.simulation.seconds)
         self.background_color = torch.tensor(BACKGROUND)
         self.crop_box: OrientedBox | None = None
-        self._untimed = 0
+        self.moments = Moments(self.made.frame_count / self.made.fps, self.made.frame_count, _say)
         self._cropped: tuple[Any, Tensor, Rasterizer] | None = None
         self._cropped_answer: tuple[int, Tensor, Answer] | None = None
         self._exported: dict[str, Tensor] | None = None
@@ -106,12 +110,17 @@ class WeatherModel(SplatfactoModel):
         how = {"stride": STRIDE, "exposure": self.made.effect.appearance.exposure, "motion": options.motion}
         return dynamics, Rollout(history, look, dynamics, self.look, **how)
 
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """Weights with which the states were made that clips take what lies from: interrupted training goes on with them."""
-        return dict(self.rollout.refreshed or {})
+    def get_extra_state(self) -> dict[str, Any]:
+        """Weights with which the states were made that clips take what lies from: interrupted training goes on with them. And a
+        digest of all that is learned, since torch reads a checkpoint whose bits have changed as if nothing were amiss."""
+        kept = dict(self.rollout.refreshed or {})
+        return {**kept, DIGEST: self._digest(kept)}
 
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        self._refreshed = state or None
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._refreshed = {name: value for name, value in state.items() if name != DIGEST} or None
+
+    def _digest(self, kept: dict[str, Tensor]) -> str:
+        return content_key({name: parameter.detach() for name, parameter in self.named_parameters()}, kept)
 
     def go_on(self) -> None:
         """Training goes on after a checkpoint was loaded: to the same bits as if it had not been broken off."""
@@ -130,13 +139,19 @@ class WeatherModel(SplatfactoModel):
         """Load what was learned; always strict, since a field that is half loaded looks trained and is not.
 
         Raises:
-            RunError: the checkpoint lacks a tensor, has one too many, or one of another shape.
+            RunError: the checkpoint lacks a tensor, has one too many or one of another shape, or is not what was stored.
         """
         try:
-            return torch.nn.Module.load_state_dict(self, state_dict, strict=True)
-        except RuntimeError as error:
-            reasons = " ".join(line.strip() for line in str(error).splitlines()[1:])
+            loaded = torch.nn.Module.load_state_dict(self, state_dict, strict=True)
+            stored = state_dict["_extra_state"][DIGEST]
+        except (RuntimeError, KeyError, TypeError, AttributeError) as error:
+            reasons = " ".join(line.strip() for line in str(error).splitlines()[1:]) or repr(error)
             raise RunError(f"the checkpoint does not fit this version of pgsd_nerfstudio, train again: {reasons}") from error
+        if stored != self._digest(self._refreshed or {}):
+            raise RunError(
+                "the checkpoint is damaged: it holds something else than was stored; take an older one or train again"
+            )
+        return loaded
 
     def weather_at(self, frame: int) -> Gaussians:
         """The weather's Gaussians in scene units at a frame of its time line, learned refinements included."""
@@ -147,29 +162,51 @@ class WeatherModel(SplatfactoModel):
         """How the frozen scene looks at a frame; None: as it was trained."""
         return (answer or self.answer).at(frame / self.history.fps)
 
-    def frame_at(self, time: float) -> int:
-        """The frame nearest to a time 0..1."""
-        return round(min(max(time, 0.0), 1.0) * (self.history.frames - 1))
-
     def get_outputs_for_camera(self, camera: NerfstudioCameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """One picture: rgb [H, W, 3], depth [H, W, 1] in scene units, accumulation [H, W, 1] and background [H, W, 3].
 
         Raises:
-            SceneError: the camera is not a perspective one.
+            SceneError: the camera is not a perspective one, or its path has times that are none of the weather.
+            RunError: the picture has no pixels, or too many.
         """
         views = from_nerfstudio(camera).to(self.device)
-        if camera.times is None:
-            frame = self._untimed % self.history.frames
-            self._untimed += 1
-        else:
-            frame = self.frame_at(float(camera.times.reshape(-1)[0]))
+        if place_in_path(camera) is not None:
+            views = Cameras(views.viewmats, views.Ks, views.width // 2 * 2, views.height // 2 * 2)
+        if min(views.width, views.height) < 1 or views.width * views.height > MOST_PIXELS:
+            raise RunError(
+                f"the pictures would have {views.width}x{views.height} pixels: expected at least one each way and at most "
+                f"{MOST_PIXELS:,} in all, use another --downscale-factor or size of the camera path"
+            )
+        frame = self.moments.of(camera)
         answer = self.weather.adjusted_answer(self.answer)
         return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame)), obb_box, answer, frame))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Tensor]:
+        """As `get_outputs_for_camera`; rays, which ns-export pointcloud, tsdf, poisson and marching-cubes ask for, are refused.
+
+        Raises:
+            RunError: the bundle is one of rays.
+        """
         if not isinstance(ray_bundle, NerfstudioCameras):
-            raise RunError("the weather is rasterized: it has no answer for single rays")
+            raise RunError(
+                "the weather is rasterized: it has no answer for single rays; of the exports there is ns-export gaussian-splat"
+            )
         return self.get_outputs_for_camera(ray_bundle)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Float[Tensor, "h w 4"]:
+        """The picture without what lies behind the scene, and how opaque it is: laid over the background again it is `rgb`.
+
+        Haze before nothing is opaque too, as much as it has to be for its colour.
+
+        Args:
+            outputs: of `get_outputs_for_camera`.
+            output_name: rgb; there is no other.
+        """
+        rgb, behind = outputs["rgb"], outputs["background"]
+        needed = torch.maximum((rgb - behind) / (1.0 - behind), 1.0 - rgb / behind).amax(dim=2, keepdim=True)
+        alpha = torch.maximum(outputs["accumulation"], needed).clamp(0.0, 1.0)
+        alone = (rgb - (1.0 - alpha) * behind) / alpha.clamp_min(1e-6)
+        return torch.cat([alone.clamp(0.0, 1.0), alpha], dim=2)
 
     def render(
         self,
@@ -220,7 +257,7 @@ class WeatherModel(SplatfactoModel):
         A viewer, which only marks the centres with a hidden cloud of points, gets the frozen scene alone.
         """
         if self._exported is None:
-            frame = self.frame_at(self.config.options.export_time)
+            frame = self.moments.at(self.config.options.export_time)
             frozen, weather = self.prepared.scene.gaussians, Gaussians.empty()
             if self.exporting:
                 weather = self.weather_at(frame).to("cpu")
@@ -241,6 +278,10 @@ class WeatherModel(SplatfactoModel):
         """How much of the picture the weather changed; photographs are no truth for a scene in which it now snows."""
         truth, rgb = batch["image"][..., :3].to(outputs["rgb"]), outputs["rgb"]
         return {"changed_by_weather": float((rgb - truth).abs().mean())}, {"img": torch.cat([truth, rgb], dim=1)}
+
+
+def _say(line: str) -> None:
+    Console(stderr=True, highlight=False).print(line, style="dim", markup=False, soft_wrap=True)
 
 
 def fidelity(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> dict[str, float]:

@@ -29,7 +29,7 @@ from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, Trajectory
 from pgsd_nerfstudio.plugin.distiller import Distiller, open_prior
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig, fidelity
-from pgsd_nerfstudio.plugin.opening import prepare_weather, stored_weather
+from pgsd_nerfstudio.plugin.opening import keep_weather, prepare_weather, resumed_weather, stored_weather
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.summary import print_summary
@@ -49,6 +49,8 @@ class WeatherPipelineConfig(VanillaPipelineConfig):
     model: WeatherModelConfig = field(default_factory=WeatherModelConfig)
     options: RunOptions = field(default_factory=RunOptions.unset)
     run_folder: Path | None = None
+    resumed_folder: Path | None = None
+    """Of the run that training goes on from."""
 
     def share(self, options: RunOptions) -> None:
         """One record of options for all three."""
@@ -93,8 +95,11 @@ class WeatherPipeline(VanillaPipeline):
         self.datamanager = config.datamanager.setup(
             device=device, test_mode=test_mode, world_size=world_size, local_rank=local_rank
         )
-        found = stored_weather if prior is None else prepare_weather
-        weather = found(self.datamanager.prepared, config.options, config.run_folder)
+        prepared, options = self.datamanager.prepared, config.options
+        if prior is None:
+            weather = stored_weather(prepared, options, config.run_folder)
+        else:
+            weather = resumed_weather(prepared, options, config.resumed_folder) or prepare_weather(prepared, options)
         self._model = config.model.setup(
             scene_box=self.datamanager.train_dataset.scene_box,
             num_train_data=len(self.datamanager.train_dataset),
@@ -104,6 +109,8 @@ class WeatherPipeline(VanillaPipeline):
         self._model.to(device)
         if prior is not None:
             self.distiller = Distiller.of(prior, config.options, weather.scene.description)
+            if config.run_folder is not None:
+                keep_weather(weather, config.run_folder)
             print_summary(console, config.options, weather, self.distiller)
 
     @property

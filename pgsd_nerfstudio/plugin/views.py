@@ -10,6 +10,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.scene_box import SceneBox
 from PIL import Image
 
+from pgsd_nerfstudio.plugin.moments import marked_as_views
 from pgsd_nerfstudio.plugin.run_cameras import to_nerfstudio
 from pgsd_nerfstudio.storage import atomic_write, cache_dir
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
@@ -21,14 +22,21 @@ class Views(InputDataset):
     Where the scene has no photographs, each view is rendered when it is first asked for and kept as a picture in the cache.
     """
 
-    def __init__(self, prepared: PreparedScene, indices: list[int]) -> None:
+    def __init__(self, prepared: PreparedScene, indices: list[int], smaller: float = 1.0) -> None:
+        """Views of a scene.
+
+        Args:
+            prepared: the scene.
+            indices: numbers of the views.
+            smaller: factor by which the pictures are smaller than those of the scene's cameras.
+        """
         self.prepared, self.indices = prepared, indices
-        super().__init__(view_outputs(prepared, indices))
+        super().__init__(view_outputs(prepared, indices, smaller))
 
     def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "h w 3"]:
         """The picture in the size of its camera: the photograph, or the frozen scene."""
         path = self.image_filenames[image_idx]
-        size = (self.prepared.scene.cameras.width, self.prepared.scene.cameras.height)
+        size = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
         if not path.is_file():
             picture = Image.fromarray(self._render(self.indices[image_idx]))
             with atomic_write(path) as beside:
@@ -43,7 +51,7 @@ class Views(InputDataset):
         return (rgb.clamp(0, 1) * 255 + 0.5).byte().cpu().numpy()
 
 
-def view_outputs(prepared: PreparedScene, indices: list[int]) -> DataparserOutputs:
+def view_outputs(prepared: PreparedScene, indices: list[int], smaller: float = 1.0) -> DataparserOutputs:
     """What a dataparser would say of these views; scene units are the run's coordinates, so its transform is the identity."""
     scene = prepared.scene
     if scene.images and all(path.is_file() for path in scene.images):
@@ -52,8 +60,11 @@ def view_outputs(prepared: PreparedScene, indices: list[int]) -> DataparserOutpu
         folder = cache_dir() / "views" / scene.content_key()
         names = [folder / f"view_{i:04d}.png" for i in indices]
     centers = scene.cameras.centers
+    cameras = scene.cameras[torch.tensor(indices)].resized(
+        max(1, round(scene.cameras.width / smaller)), max(1, round(scene.cameras.height / smaller))
+    )
     return DataparserOutputs(
         image_filenames=names,
-        cameras=to_nerfstudio(scene.cameras[torch.tensor(indices)], torch.linspace(0.0, 1.0, len(indices))),
+        cameras=marked_as_views(to_nerfstudio(cameras, torch.linspace(0.0, 1.0, len(indices)))),
         scene_box=SceneBox(aabb=torch.stack([centers.amin(0), centers.amax(0)])),
     )
