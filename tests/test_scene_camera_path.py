@@ -1,9 +1,18 @@
-"""Laws of the camera path of a preview: calm, between views that see the middle, and the same whichever part is asked for."""
+"""Laws of camera paths: calm, between views that see the middle, the same whichever part is asked for; around, ahead, still."""
+
+from itertools import pairwise
 
 import pytest
 import torch
 
-from pgsd_nerfstudio.scene.camera_path import DEGREES_PER_SECOND, choose_views, slow_path
+from pgsd_nerfstudio.scene.camera_path import (
+    DEGREES_PER_SECOND,
+    choose_views,
+    dolly_path,
+    orbit_path,
+    slow_path,
+    still_path,
+)
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -75,3 +84,78 @@ def test_shots_of_one_path_join():
     whole = slow_path(seen_by(cameras), views=(0, 3), frames=250)
     part = slow_path(seen_by(cameras), views=(0, 3), start=100, frames=150)
     assert torch.allclose(whole.viewmats[100:], part.viewmats, atol=1e-5)
+
+
+# Around, ahead, on the spot.
+
+
+def lifted(cameras: Cameras) -> Scene:
+    """The ring's scene in turned and shifted axes of half a metre, as captures are."""
+    turned = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)))[0]
+    turned = turned * torch.linalg.det(turned)
+    frame = Frame(0.5, turned, torch.tensor([3.0, -1.0, 2.0]))
+    poses = cameras.opengl()
+    poses[:, :3, :3] = frame.rotation.T @ poses[:, :3, :3]
+    poses[:, :3, 3] = frame.to_scene(poses[:, :3, 3])
+    return Scene("lifted", Gaussians.empty(), Cameras.from_opengl(poses, cameras.Ks, cameras.width, cameras.height), frame)
+
+
+def test_an_orbit_keeps_its_distance_and_looks_at_the_middle():
+    scene = lifted(ring(12, height=1.5, radius=4.0))
+    path = orbit_path(scene, frames=36)
+    poses = scene.frame.cameras_to_metric(path).opengl()
+    centers = poses[:, :3, 3]
+    torch.testing.assert_close(centers[:, :2].norm(dim=1), torch.full((36,), 4.0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(centers[:, 2], torch.full((36,), 1.5), atol=1e-3, rtol=0)
+    # The views look at a point one metre above the ground: it stays in the middle of the picture, and up stays up.
+    target = scene.frame.to_scene(torch.tensor([0.0, 0.0, 1.0]))
+    local = path.viewmats[:, :3, :3] @ target + path.viewmats[:, :3, 3]
+    seen = torch.einsum("nij,nj->ni", path.Ks, local)
+    torch.testing.assert_close(seen[:, :2] / seen[:, 2:], torch.tensor([64.0, 48.0]).expand(36, 2), atol=0.05, rtol=0)
+    assert (poses[:, 2, 1] > 0.9).all() and poses[:, 2, 0].abs().max() < 1e-4
+
+
+def test_a_full_orbit_closes_without_showing_its_first_view_twice():
+    scene = seen_by(ring(12))
+    azimuth = [torch.atan2(c[1], c[0]) for c in orbit_path(scene, frames=8).centers]
+    steps = torch.stack([(after - before) % (2 * torch.pi) for before, after in pairwise([*azimuth, azimuth[0]])])
+    torch.testing.assert_close(steps, torch.full((8,), torch.pi / 4), atol=1e-4, rtol=0)
+    half = orbit_path(scene, frames=5, degrees=-180.0).centers
+    torch.testing.assert_close(half[0] + half[-1], torch.tensor([0.0, 0.0, 3.0]), atol=1e-3, rtol=0)
+
+
+def test_a_dolly_goes_straight_ahead_a_part_of_the_way():
+    scene = seen_by(ring(12))
+    path = dolly_path(scene, frames=5, view=3, forward=0.4)
+    pose = scene.cameras.opengl()[3]
+    torch.testing.assert_close(path.opengl()[:, :3, :3], pose[:3, :3].expand(5, 3, 3), atol=1e-5, rtol=0)
+    way = pose[:3, 3].norm()
+    expected = pose[:3, 3] - torch.linspace(0, 0.4, 5)[:, None] * way * pose[:3, 2]
+    torch.testing.assert_close(path.centers, expected, atol=1e-4, rtol=0)
+    assert float(path.centers[-1].norm()) < float(path.centers[0].norm())
+
+
+def test_a_still_camera_does_not_move():
+    scene = seen_by(ring(12))
+    path = still_path(scene, frames=4, view=7)
+    assert len(path) == 4 and (path.viewmats == scene.cameras.viewmats[7]).all()
+    assert (still_path(scene, frames=1).viewmats == scene.cameras.viewmats[choose_views(scene.cameras, scene.frame)[0]]).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda scene: orbit_path(scene, frames=0), "frames >= 1"),
+        (lambda scene: orbit_path(scene, frames=2, degrees=float("nan")), "finite number of degrees"),
+        (
+            lambda scene: orbit_path(seen_by(ring(5, radius=1e-3)), frames=2),
+            "from the middle of the scene: an orbit needs views",
+        ),
+        (lambda scene: dolly_path(scene, frames=2, forward=1.5), "less than the whole way"),
+        (lambda scene: dolly_path(scene, frames=2, view=12), "must lie in 0-11"),
+        (lambda scene: still_path(scene, frames=2, view=-1), "must lie in 0-11"),
+    ],
+)
+def test_paths_that_cannot_be_are_refused(make, sentence: str):
+    with pytest.raises(ValueError, match=sentence):
+        make(seen_by(ring(12)))

@@ -14,7 +14,9 @@ import tyro
 from pgsd_nerfstudio.cli.bench import Bench
 from pgsd_nerfstudio.cli.cache import Cache
 from pgsd_nerfstudio.cli.doctor import Doctor
+from pgsd_nerfstudio.cli.path import PathCommand
 from pgsd_nerfstudio.cli.preview import Preview
+from pgsd_nerfstudio.cli.render import Render
 from pgsd_nerfstudio.cli.simulate import Simulate
 from pgsd_nerfstudio.cli.verify import Verify
 from pgsd_nerfstudio.refusal import Refusal
@@ -23,6 +25,8 @@ from pgsd_nerfstudio.version import __version__
 Command = (
     Annotated[Preview, tyro.conf.subcommand("preview")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[PathCommand, tyro.conf.subcommand("path")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Cache, tyro.conf.subcommand("cache")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

@@ -1,9 +1,12 @@
-"""A slow camera path from one training view towards another, so that the camera shows only what was captured."""
+"""Camera paths that stay where something was captured: between two training views, around the middle, ahead, or on the spot."""
 
 from __future__ import annotations
 
+import math
+
 import roma
 import torch
+from torch import Tensor
 
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
 from pgsd_nerfstudio.scene.frame import Frame
@@ -12,6 +15,8 @@ from pgsd_nerfstudio.scene.scene import Scene
 TURN = 25.0  # degrees between the two views: enough for parallax, and both views saw what lies between them
 DEGREES_PER_SECOND = 3.0  # slow enough that the motion of the particles is seen and not that of the camera
 SLOPE = 20.0  # degrees below the horizon: views that look up see sky, views that look straight down see no snow fall
+
+NEAREST = 0.05  # m from the middle of the scene: an orbit must be at least so wide
 
 
 def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
@@ -64,3 +69,97 @@ def slow_path(scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, v
     turn = float(torch.rad2deg(roma.rotmat_geodesic_distance(poses[0], poses[1])))
     whole = max(2, start + frames, round(turn / DEGREES_PER_SECOND * fps))
     return interpolate(cameras, first, last, whole)[slice(start, start + frames)]
+
+
+def orbit_path(scene: Scene, *, frames: int, degrees: float = 360.0) -> Cameras:
+    """Cameras on a circle around the middle of the scene, as far away and as high as its training views stand in the median.
+
+    They look at the height that the training views look at; a full circle ends where it began, without showing that view twice.
+
+    Args:
+        scene: the scene with its training views.
+        frames: number of cameras.
+        degrees: by how much the path turns, against the clock as seen from above; negative: with it.
+
+    Raises:
+        ValueError: a number is out of its range, or all views stand in the middle of the scene.
+    """
+    if frames < 1 or not abs(degrees) < float("inf"):
+        raise ValueError(f"an orbit has frames >= 1 and a finite number of degrees, got {frames} and {degrees:g}")
+    poses = scene.frame.cameras_to_metric(scene.cameras).opengl().double()
+    centers, forward = poses[:, :3, 3], -poses[:, :3, 2]
+    away = centers[:, :2].norm(dim=1)
+    radius, height = float(away.median()), float(centers[:, 2].median())
+    if radius < NEAREST:
+        raise ValueError(
+            f"the training views stand {radius:.2g} m from the middle of the scene: an orbit needs views around it"
+        )
+    # Where each line of sight passes nearest to the vertical through the middle.
+    ahead = -(centers[:, :2] * forward[:, :2]).sum(1) / forward[:, :2].square().sum(1).clamp_min(1e-6)
+    seen = (centers[:, 2] + ahead * forward[:, 2])[ahead > 0]
+    target = torch.tensor([0.0, 0.0, float(seen.median()) if len(seen) else 0.0], dtype=torch.float64)
+    nearest = int(((away - radius).abs() + (centers[:, 2] - height).abs()).argmin())
+    start = torch.atan2(centers[nearest, 1], centers[nearest, 0])
+    closed = math.isclose(abs(degrees) % 360.0, 0.0)
+    turn = torch.linspace(0.0, math.radians(degrees), frames + closed, dtype=torch.float64)[:frames]
+    azimuth = start + turn
+    around = torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), torch.full_like(azimuth, height)], dim=1)
+    return _from_metric(scene, around, target - around, scene.cameras.Ks[nearest])
+
+
+def dolly_path(scene: Scene, *, frames: int, forward: float = 0.3, view: int | None = None) -> Cameras:
+    """Cameras on the line of sight of a training view, straight ahead.
+
+    Args:
+        scene: the scene with its training views.
+        frames: number of cameras.
+        forward: how far they go, as a part of the way to the middle of the scene; negative: backwards.
+        view: number of the training view; by default the first of `choose_views`.
+
+    Raises:
+        ValueError: there is no such view, or a number is out of its range.
+    """
+    if frames < 1 or not abs(forward) < 1.0:
+        raise ValueError(
+            f"a dolly has frames >= 1 and goes less than the whole way to the middle, got {frames} and {forward:g}"
+        )
+    start = scene.cameras[_view(scene, view)]
+    pose = start.opengl()[0]
+    way = (scene.frame.origin - pose[:3, 3]).norm()
+    at = torch.linspace(0.0, forward, frames)[:, None] * way
+    poses = pose.repeat(frames, 1, 1)
+    poses[:, :3, 3] = pose[:3, 3] - at * pose[:3, 2]
+    return Cameras.from_opengl(poses, start.Ks.repeat(frames, 1, 1), start.width, start.height)
+
+
+def still_path(scene: Scene, *, frames: int, view: int | None = None) -> Cameras:
+    """The same training view again and again: only the weather moves.
+
+    Args:
+        scene: the scene with its training views.
+        frames: number of cameras.
+        view: number of the training view; by default the first of `choose_views`.
+
+    Raises:
+        ValueError: there is no such view, or there is no frame.
+    """
+    if frames < 1:
+        raise ValueError(f"a path has frames >= 1, got {frames}")
+    return scene.cameras[torch.full((frames,), _view(scene, view))]
+
+
+def _view(scene: Scene, view: int | None) -> int:
+    if view is not None and not 0 <= view < len(scene.cameras):
+        raise ValueError(f"the view must lie in 0-{len(scene.cameras) - 1}, the training views of this scene, got {view}")
+    return choose_views(scene.cameras, scene.frame)[0] if view is None else view
+
+
+def _from_metric(scene: Scene, centers: Tensor, forward: Tensor, K: Tensor) -> Cameras:
+    """Cameras at metric places [t, 3] that look along metric directions [t, 3] with up above them, in scene units."""
+    back = -torch.nn.functional.normalize(forward, dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=back.dtype).expand_as(back)
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=1)
+    turn = torch.stack([right, torch.linalg.cross(back, right), back], dim=2)
+    frame, size = scene.frame, scene.cameras
+    poses = torch.cat([frame.rotation.T.to(turn) @ turn, frame.to_scene(centers)[:, :, None]], dim=2).float()
+    return Cameras.from_opengl(poses, K.repeat(len(poses), 1, 1), size.width, size.height)
