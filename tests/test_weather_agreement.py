@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -231,6 +232,23 @@ def test_exposure_masks_and_a_cut_out_splat_do_not_matter(capture, tmp_path):
     part = whole.select(torch.arange(len(whole)) % 3 > 0)
     scene = load_scene(write_splat(tmp_path / "part.ply", part), tmp_path)
     assert "look like their photographs" in scene.remarks[-1]
+
+
+def test_matted_photographs_of_a_splat_with_a_background_agree(capture, tmp_path):
+    """What was cut out of the photographs tells nothing, whatever colour it has."""
+    (tmp_path / "images").mkdir()
+    y, x = np.mgrid[:SIDE, :SIDE] - SIDE / 2
+    for index in range(VIEWS):
+        picture = np.asarray(Image.open(capture / "images" / f"{index}.png"))
+        inside = np.hypot(x, y) < 0.2 * SIDE
+        matted = np.dstack([np.where(inside[..., None], picture, 0), np.where(inside, 255, 0)]).astype(np.uint8)
+        Image.fromarray(matted, "RGBA").save(tmp_path / "images" / f"{index}.png")
+    shutil.copy(capture / "transforms.json", tmp_path)
+    scene = load_scene(capture / "splat.ply", tmp_path)
+    assert "look like their photographs" in scene.remarks[-1]
+    data = in_other_coordinates(tmp_path, tmp_path / "data", **as_frames(tmp_path, poses_of(tmp_path).roll(3, dims=0)))
+    with pytest.raises(SceneError, match="do not fit the splat"):
+        load_scene(capture / "splat.ply", data)
 
 
 @pytest.mark.slow

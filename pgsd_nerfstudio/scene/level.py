@@ -67,7 +67,7 @@ def upright(gaussians: Gaussians) -> Float64[Tensor, "3"] | None:
     if share < max(LEAST_SHARE, CLEARLY * max(others, default=0.0)) or max(above, below) < ONE_SIDED * min(above, below):
         return None
     up = up if above > below else -up
-    return up.round() if float(up.abs().max()) > SNAP else up
+    return up.round() + 0.0 if float(up.abs().max()) > SNAP else up  # no -0, which would be told
 
 
 def _gathered(

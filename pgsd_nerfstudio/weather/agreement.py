@@ -92,7 +92,7 @@ def _told(likeness: Likeness) -> str:
 
 
 Picture = tuple[int, Float[Tensor, "h w 3"], Float[Tensor, "h w"]]
-"""Number of a view, its photograph, and 1 where the photograph is known."""
+"""Number of a view, its photograph, and 1 where the photograph is known and opaque."""
 
 
 def _small(cameras: Cameras) -> Cameras:
@@ -107,7 +107,7 @@ def _photographs(scene: Scene) -> list[Picture]:
     cameras, found = _small(scene.cameras), []
     for index in chosen:
         seen = read_photograph(scene.photographs[index], cameras[index])
-        known = seen.known.float()
+        known = seen.known * seen.opacity
         if float(_detail(seen.rgb.mean(-1), known).square().mul(known).sum() / known.sum().clamp_min(1.0)) >= LEAST_CONTRAST**2:
             found.append((index, seen.rgb, known))
     return found

@@ -63,6 +63,8 @@ class Seen:
     """0..1."""
     known: Bool[Tensor, "h w"]
     """Whether the photograph shows this pixel: not beyond its edge, and not masked out."""
+    opacity: Float[Tensor, "h w"]
+    """0..1; below 1 the background shows through."""
 
 
 def find_photographs(names: Sequence[str], folders: Sequence[Path]) -> list[Path]:
@@ -155,13 +157,14 @@ def read_photograph(
     picture = _opened(photograph.path, lens, coarse)
     rgb, alpha = picture.planes[:3], picture.planes[3:]
     behind = torch.as_tensor(background, dtype=torch.float32).cpu()[:, None, None]
-    sampled, inside = _sampled(replace(picture, planes=rgb * alpha + behind * (1 - alpha)), at, lens)
+    composited = torch.cat([rgb * alpha + behind * (1 - alpha), alpha])
+    sampled, inside = _sampled(replace(picture, planes=composited), at, lens)
     known = drawn & inside
     if photograph.mask is not None and is_there(photograph.mask):
         mask = _opened(photograph.mask, lens, coarse)
         trained_on, inside = _sampled(replace(mask, planes=(mask.planes[:3].amax(0, keepdim=True) > 0).float()), at, lens)
         known &= inside & (trained_on[0] > 0.5)
-    return Seen(sampled.permute(1, 2, 0).contiguous(), known)
+    return Seen(sampled[:3].permute(1, 2, 0).contiguous(), known, sampled[3])
 
 
 @dataclass(frozen=True)
