@@ -116,11 +116,22 @@ def test_up_that_is_given_is_up(tmp_path):
 
 
 def test_a_scale_that_puts_the_cameras_where_nobody_stands_is_doubted(tmp_path):
+    """Drones fly at 100 m; no camera is at 1,000 m or at a millimetre. What is said gives the scale of a camera in the hand."""
     write_ply(tmp_path / "a.ply", n=200)
     data = write_transforms(tmp_path / "transforms.json")
-    assert not any("is the scale right" in remark for remark in read_scene(tmp_path / "a.ply", data).remarks)
-    (remark,) = [r for r in read_scene(tmp_path / "a.ply", data, metres_per_unit=1000.0).remarks if "is the scale right" in r]
-    assert "at 1000 m per unit the cameras stand" in remark
+    plain = read_scene(tmp_path / "a.ply", data)
+    assert not any("is the scale right" in remark for remark in plain.remarks)
+    per_metre = plain.frame.metres_per_unit / 1.5
+    for height in (100.0, 0.05):
+        scene = read_scene(tmp_path / "a.ply", data, metres_per_unit=height * per_metre)
+        (remark,) = [remark for remark in scene.remarks if "is the scale right" in remark]
+        assert f"the cameras stand {height:.3g} m above the ground" in remark
+        assert f"at {plain.frame.metres_per_unit:.3g} m per unit they would stand 1.5 m above it" in remark
+    for height, said in ((3000.0, "3,000"), (0.001, "0.001")):
+        with pytest.raises(SceneError, match=rf"the cameras stand {said} m above the ground, where no camera can be"):
+            read_scene(tmp_path / "a.ply", data, metres_per_unit=height * per_metre)
+    with pytest.raises(SceneError, match="where no camera can be"):
+        read_scene("demo", metres_per_unit=1e5)
 
 
 def test_photographs_that_are_missing_are_counted(tmp_path):

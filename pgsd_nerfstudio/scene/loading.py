@@ -11,7 +11,7 @@ import torch
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.captures.capture import Capture
 from pgsd_nerfstudio.scene.errors import SceneError
-from pgsd_nerfstudio.scene.frame import Frame, direction, estimate_frame
+from pgsd_nerfstudio.scene.frame import CAMERA_HEIGHT, Frame, direction, estimate_frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.level import upright
 from pgsd_nerfstudio.scene.orbit import VIEWS, orbit
@@ -25,7 +25,8 @@ Up = str | tuple[float, float, float]
 
 # Names of files and folders that do not describe the scene in them.
 NAMELESS = {"data", "pointcloud", "splat", "scene", "output", "outputs", "export", "exports", "images", "nerfstudio"}
-HIGH, LOW = 100.0, 0.1  # m: cameras that stand higher above the ground or lower are doubted
+HIGH, LOW = 50.0, 0.1  # m: cameras that stand higher above the ground or lower are doubted; a drone flies at 100 m,
+HIGHEST, LOWEST = 1000.0, 0.01  # m: but not at 1,000 m, and no camera sees anything from less than a centimetre
 
 
 def read_scene(
@@ -91,7 +92,8 @@ def _demo(known: Known, description: str | None) -> Scene:
     elif known[0] is not None:
         frame = replace(scene.frame, metres_per_unit=known[0], source=f"{scene.frame.source}; scale as given")
         scene = replace(scene, frame=frame)
-    return replace(scene, description=description or scene.description, known=known)
+    remarks = tuple(_doubts(scene.cameras, scene.frame, known[0]))
+    return replace(scene, description=description or scene.description, known=known, remarks=remarks)
 
 
 def _made(
@@ -135,11 +137,24 @@ def _missing(capture: Capture) -> list[str]:
 
 
 def _doubts(cameras: Cameras, frame: Frame, metres_per_unit: float | None) -> list[str]:
-    """What is to be said of a given scale that puts the cameras where nobody stands."""
+    """What is to be said of a given scale that puts the cameras where nobody stands.
+
+    Raises:
+        SceneError: no camera can be where they are.
+    """
     height = float(frame.to_metric(cameras.centers)[:, 2].median())
     if metres_per_unit is None or LOW <= height <= HIGH:
         return []
-    return [f"at {metres_per_unit:g} m per unit the cameras stand {height:.3g} m above the ground: is the scale right?"]
+    stand = f"{height:,.0f}" if height >= 100 else f"{height:.3g}"
+    where = f"at {metres_per_unit:g} m per unit the cameras stand {stand} m above the ground"
+    usual = metres_per_unit * CAMERA_HEIGHT / height
+    if LOWEST <= height <= HIGHEST or usual <= 0:
+        hint = f": at {usual:.3g} m per unit they would stand {CAMERA_HEIGHT:g} m above it" if usual > 0 else ""
+        return [f"{where}: is the scale right{hint}?"]
+    raise SceneError(
+        f"{where}, where no camera can be: leave metres_per_unit= out to have the scale estimated, or pass {usual:.3g}, with "
+        f"which they stand {CAMERA_HEIGHT:g} m above it"
+    )
 
 
 def _described(name: str) -> str:
