@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from plyfile import PlyData
 from rounds import round_of
 
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.frame import Frame, estimate_frame
-from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.frame import Frame, attention, estimate_frame
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.weather.loading import load_scene
 
 
@@ -158,6 +159,20 @@ def test_cameras_that_all_look_one_way_still_have_a_frame():
     assert found.origin[2].item() == pytest.approx(0.0, abs=0.03)
     with pytest.raises(ValueError, match="at least one camera"):
         estimate_frame(one[torch.zeros(0, dtype=torch.long)], terrace())
+
+
+@pytest.mark.parametrize("radius", [200.0, 1e5])
+def test_a_sphere_of_sky_changes_no_frame(radius):
+    """Neither for cameras around a middle, nor for those that look one way, whose middle follows from the Gaussians."""
+    bare, count = terrace(), len(terrace()) // 4
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    domed = concatenate([bare, replace(bare.select(torch.arange(count)), means=radius * directions)])
+    one = round_of(1, 2.5, 1.5, target=1.5)
+    same_way = Cameras(one.viewmats.repeat(6, 1, 1), one.Ks.repeat(6, 1, 1), 128, 128)
+    for cameras in (round_of(12, 2.5, 1.5), same_way):
+        expected, found = estimate_frame(cameras, bare), estimate_frame(cameras, domed)
+        assert found.metres_per_unit == expected.metres_per_unit and torch.equal(found.origin, expected.origin)
+        assert torch.equal(found.rotation, expected.rotation) and attention(cameras, domed)[1] == attention(cameras, bare)[1]
 
 
 def test_a_scene_without_ground_says_so():

@@ -22,6 +22,7 @@ CAMERA_HEIGHT = 1.5  # m above the ground, of a camera held by a standing person
 SNAP = 2.0  # degrees: an estimated up this close to +z is +z
 ORIENTED_WITHIN = 25.0  # degrees: if up cannot be estimated well, a +z this close to the cameras' mean up is trusted
 MIN_SPREAD = 0.05  # mean square of the horizontal axes across their main direction: views from an arc of 45 degrees
+SKY = 10.0  # a Gaussian so many times farther away than the median is sky
 CELLS = 32  # ground samples across the area inside the cameras' ring
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 """Directions that have a name."""
@@ -203,7 +204,7 @@ def attention(cameras: Cameras, gaussians: Gaussians) -> tuple[Float[Tensor, "3"
     """The point nearest to all optical axes (least squares) and the cameras' median distance from it.
 
     Cameras that look outward or all in one direction have no such point before them. For them the point lies half the median
-    distance of the Gaussians ahead of their mean position, and that median is the distance.
+    distance of the Gaussians ahead of their mean position, and that median is the distance. The sky does not count.
 
     Args:
         cameras: at least one, in scene units.
@@ -217,7 +218,10 @@ def attention(cameras: Cameras, gaussians: Gaussians) -> tuple[Float[Tensor, "3"
         point = torch.linalg.solve(system, (across @ centers[:, :, None]).mean(0)).squeeze(1)
         if (((point - centers) * forward).sum(1) > 0).double().mean() > 0.5:
             return point, float((centers - point).norm(dim=1).median())
-    reach = (gaussians.means.double() - middle).norm(dim=1).median() if len(gaussians) else torch.tensor(1.0)
+    distances = (gaussians.means.double().cpu() - middle).norm(dim=1)
+    while (sky := distances > SKY * (distances.median() if len(distances) else 1.0)).any():
+        distances = distances[~sky]
+    reach = distances.median() if len(distances) else torch.tensor(1.0)
     return middle + 0.5 * reach * forward.mean(0), float(reach)
 
 
