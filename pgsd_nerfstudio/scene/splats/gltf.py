@@ -150,8 +150,7 @@ class _File:
     def view(self, index: Any) -> tuple[bytes, dict]:
         """Bytes of a buffer view, and its entry."""
         view = self.item("bufferViews", index)
-        if packing := next((name for name in OTHER_PACKINGS if name in view.get("extensions", {})), None):
-            raise _Fault(f"it is packed with {packing}, which is not read; gltfpack or gltf-transform unpacks it")
+        _refuse_packed(view.get("extensions", {}))
         buffer = self._buffer(view.get("buffer"))
         start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
         if start < 0 or length < 0 or start + length > len(buffer):
@@ -162,8 +161,10 @@ class _File:
         """[count, size] values, float32."""
         entry = self.item("accessors", index)
         kind, count = np.dtype("<" + TYPES[entry["componentType"]]), int(entry["count"])
-        if "sparse" in entry or "bufferView" not in entry or SIZES.get(entry["type"]) != size:
-            raise _Fault(f"accessor {index} is sparse or of the type {str(entry.get('type'))[:20]}")
+        if "sparse" in entry or "bufferView" not in entry:
+            raise _Fault(f"accessor {index} is sparse or has no bytes of its own")
+        if SIZES.get(entry["type"]) != size:
+            raise _Fault(f"accessor {index} is of the type {str(entry['type'])[:20]}")
         data, view = self.view(entry["bufferView"])
         start, stride = int(entry.get("byteOffset", 0)), int(view.get("byteStride") or kind.itemsize * size)
         if (
@@ -204,6 +205,11 @@ class _File:
             raise _Fault(f"its file {name} cannot be opened ({error.strerror})") from error
 
 
+def _refuse_packed(extensions: dict) -> None:
+    if packing := next((name for name in OTHER_PACKINGS if name in extensions), None):
+        raise _Fault(f"it is packed with {packing}, which is not read; gltf-transform unpacks it")
+
+
 def _transform(node: dict) -> Tensor:
     """[4, 4] of a node: a matrix by columns, or translation, rotation (xyzw) and scale."""
     if "matrix" in node:
@@ -236,6 +242,7 @@ def _primitive(file: _File, primitive: dict) -> Gaussians:
         raise _Fault(f"its colours are {str(space)[:40]}; srgb_rec709_display is read")
     if packing := next((name for name in PACKED if name in extensions), None):
         return unpacked(file.path, file.view(extensions[packing]["bufferView"])[0], axes="LUF")
+    _refuse_packed(extensions)
     held = {name.removeprefix(f"{SPLATS}:"): index for name, index in primitive["attributes"].items()}
     if missing := [name for name in ATTRIBUTES if name not in held]:
         raise _Fault(f"its Gaussians lack {', '.join(missing)}; write them with a newer version of the converter")

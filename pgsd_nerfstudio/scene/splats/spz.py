@@ -1,8 +1,8 @@
 """Read .spz, Niantic's packed splats: versions 1 to 3 in one gzip stream, version 4 in a zstd frame for each kind of value.
 
 Format: https://github.com/nianticlabs/spz (README and src/cc/load-spz.cc, July 2026). Centres are 24-bit fixed point, log
-scales and opacities bytes, colours bytes of 0.15 f_dc + 0.5, harmonics bytes over -1..1. The axes are those in which the file
-was written: the format does not say which they were, except by the extension SPZ_ADOBE_coordinate_system.
+scales and opacities bytes, colours bytes of 0.15 f_dc + 0.5, harmonics bytes over -1..1. The format asks for axes to the right,
+up and back; converters store those of their .ply instead, and only the extension SPZ_ADOBE_coordinate_system says so.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ANTIALIASED, EXTENDED = 1, 2  # flags
 AXES = 0xADBE0003  # the extension that names them
 # By its number from 1: which way x, y and z point, right or left, up or down, front or back.
 USUAL = "RUB"
-"""Axes that the format asks for; most converters store those of the .ply instead."""
+"""Axes that the format asks for."""
 SYSTEMS = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU")
 
 
