@@ -82,9 +82,9 @@ class TrajectoryDataManager(VanillaDataManager):
         self.train_dataparser_outputs = self.train_dataset._dataparser_outputs
         DataManager.__init__(self)
         chosen = torch.linspace(0, count - 1, min(EVAL_VIEWS, count)).round().long()
-        evaluated = Views(self.prepared, chosen.tolist(), smaller)
-        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(input_dataset=evaluated, device=device)
-        self.eval_dataloader = FixedIndicesEvalDataloader(input_dataset=evaluated, device=device)
+        self.evaluated = Views(self.prepared, chosen.tolist(), smaller)
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(input_dataset=self.evaluated, device=device)
+        self.eval_dataloader = FixedIndicesEvalDataloader(input_dataset=self.evaluated, device=device)
 
     def setup_train(self) -> None:
         """Nothing to load: trajectories are made when they are asked for."""

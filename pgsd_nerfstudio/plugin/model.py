@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras as NerfstudioCameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.base_model import Model
@@ -30,6 +30,7 @@ from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.panel import Panel, uninterrupted
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
 from pgsd_nerfstudio.plugin.splat import splat_tensors
+from pgsd_nerfstudio.plugin.views import BACKGROUND
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
 from pgsd_nerfstudio.response.answer import Answer, Shown, baked
@@ -41,7 +42,6 @@ from pgsd_nerfstudio.weather.weather import Weather
 
 DIGEST = "digest"
 MOST_PIXELS = 2**26  # 8192 x 8192: more than any video format takes
-BACKGROUND = (0.149, 0.1647, 0.2157)  # behind the splat: what nerfstudio shows behind splatfacto's
 STRIDE = 8  # frames between kept states: a jump in time, and what lies in a training clip, costs 3.5 frames on average
 
 
@@ -284,11 +284,24 @@ def _say(line: str) -> None:
     Console(stderr=True, highlight=False).print(line, style="dim", markup=False, soft_wrap=True)
 
 
-def fidelity(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> dict[str, float]:
-    """PSNR in dB and SSIM of a render against a photograph."""
-    # Imported here: it takes seconds, and every ns-* command loads this module.
-    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+def fidelity(rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> dict[str, float]:
+    """PSNR in dB and SSIM of a render against a photograph.
 
-    ours, theirs = (picture.permute(2, 0, 1)[None] for picture in (rgb, truth))
-    ssim = structural_similarity_index_measure(ours, theirs, data_range=1.0)
-    return {"psnr": float(peak_signal_noise_ratio(ours, theirs, data_range=1.0)), "ssim": float(ssim)}  # type: ignore[arg-type]
+    Args:
+        rgb: the render.
+        truth: the photograph.
+        known: the pixels that the photograph shows; the mean of SSIM is over those whose whole window it shows.
+
+    Returns:
+        "psnr" and "ssim"; the latter is NaN where no whole window is known.
+    """
+    # Imported here: it takes seconds, and every ns-* command loads this module.
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    error = (rgb - truth).square().mean(-1)[known].mean()
+    ours, theirs = (picture.permute(2, 0, 1)[None] for picture in (rgb, torch.where(known[..., None], truth, rgb)))
+    _, similar = structural_similarity_index_measure(ours, theirs, data_range=1.0, return_full_image=True)  # type: ignore[misc]
+    # Its window has 11 pixels; pixels nearer to an edge than half of that do not count, as in torchmetrics' own mean.
+    unknown = torch.nn.functional.pad((~known).float()[None, None], (5, 5, 5, 5), value=1.0)
+    whole = torch.nn.functional.max_pool2d(unknown, 11, stride=1)[0, 0] == 0
+    return {"psnr": float(-10 * error.log10()), "ssim": float(similar[0].mean(0)[whole].mean())}

@@ -229,31 +229,37 @@ class WeatherPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, float]:
-        """What ns-eval writes, as means over the evaluation views: fidelity of the frozen scene against its photographs (where
-        there are some), how much the weather changes of the pictures, pictures per second; and the drift of the motion."""
+        """What ns-eval writes, as means over the evaluation views: fidelity of the frozen scene against those of their
+        photographs that are there, how many these are, how much the weather changes of the pictures, pictures per second; and
+        the drift of the motion."""
         self.eval()
-        model, rows = self.model, []
-        photographs = bool(model.prepared.scene.images)
-        for index, (camera, batch) in enumerate(self.datamanager.fixed_indices_eval_dataloader):
+        model, rows, compared = self.model, [], 0
+        views = self.datamanager.evaluated
+        for index, (camera, _) in enumerate(self.datamanager.fixed_indices_eval_dataloader):
             began = time.perf_counter()
             snowed = model.get_outputs_for_camera(camera)["rgb"]
             row = {"fps": 1.0 / (time.perf_counter() - began)}
             frozen = model.render(from_nerfstudio(camera).to(model.device), None).rgb[0].clamp(0, 1)
             row["changed_by_weather"] = float((snowed - frozen).abs().mean())
-            if photographs:
-                truth = batch["image"][..., :3].to(frozen)
-                row |= {f"frozen_{name}": value for name, value in fidelity(frozen, truth).items()}
+            seen = views.photograph(index, model.background_color)
+            if seen is not None and seen.known.any():
+                compared += 1
+                likeness = fidelity(frozen, seen.rgb.to(frozen), seen.known.to(frozen.device))
+                row |= {f"frozen_{name}": value for name, value in likeness.items()}
             rows.append(row)
             if output_path is not None:
                 output_path.mkdir(parents=True, exist_ok=True)
                 pair = torch.cat([frozen, snowed], dim=1).permute(2, 0, 1)
                 torchvision.utils.save_image(pair.cpu(), output_path / f"eval_{index:04d}.png")
-        columns = {name: torch.tensor([row[name] for row in rows]) for name in rows[0]}
-        result = {name: float(values.mean()) for name, values in columns.items()}
+        names = dict.fromkeys(name for row in rows for name in row)
+        columns = {name: torch.tensor([row[name] for row in rows if name in row]) for name in names}
+        result = {name: float(values.nanmean()) for name, values in columns.items()}
         if get_std and len(rows) > 1:
             result |= {f"{name}_std": float(values.std()) for name, values in columns.items()}
+        if views.prepared.scene.photographs and compared < len(rows):
+            console.print(f"{len(rows) - compared} of {len(rows)} photographs are missing: no fidelity is measured there")
         self.train()
-        return {**result, "drift_m": drift(model.rollout.frames())}
+        return {**result, "photographs": float(compared), "drift_m": drift(model.rollout.frames())}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Always strict, where nerfstudio would silently keep what it does not find.
