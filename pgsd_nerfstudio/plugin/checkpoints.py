@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
 
-from pgsd_nerfstudio.plugin.environment import RunError
+from pgsd_nerfstudio.plugin.environment import RunError, allow_numpy_scalars
 
 FOLDER = "nerfstudio_models"
 """Name of the folder of checkpoints in that of a run."""
@@ -44,6 +45,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         RunError: it is missing, damaged, or no checkpoint of this method.
     """
+    allow_numpy_scalars()
     try:
         with zipfile.ZipFile(path) as file:
             broken = file.testzip()
@@ -52,6 +54,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         int(stored["step"])
     except FileNotFoundError as error:
         raise RunError(f"there is no checkpoint at {path}") from error
+    except UnpicklingError as error:
+        raise RunError(f"{path} is not opened: it holds something else than tensors and numbers, or is damaged") from error
     except Exception as error:  # whatever zipfile, torch and pickle meet in bytes that are not theirs
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise RunError(f"the checkpoint {path} is damaged ({reason}): take an older one or train anew") from error
