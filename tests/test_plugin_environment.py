@@ -48,6 +48,13 @@ def test_errors_that_are_sentences_leave_without_a_traceback(
     assert capsys.readouterr().err == f"pgsd-weather: {error}\n"
 
 
+def test_an_interrupted_command_ends_without_a_traceback_and_with_130():
+    program = "import os, signal, time, pgsd_nerfstudio.plugin.environment as e; e._show_sentences()"
+    waiting = f"{program}; os.kill(os.getpid(), signal.SIGINT); time.sleep(30)"
+    done = subprocess.run(["bash", "-c", f"{sys.executable} -c '{waiting}'; exit $?"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
 def test_other_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
     shown = []
     monkeypatch.setattr(sys, "excepthook", lambda *found: shown.append(found))

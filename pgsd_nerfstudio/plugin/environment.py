@@ -65,6 +65,10 @@ def _show_sentences() -> None:
         return
 
     def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if isinstance(error, KeyboardInterrupt) and not os.environ.get("PGSD_TRACEBACK"):
+            # Python then ends the process with 130, unless anything is imported here: that makes it forget the interruption.
+            print("interrupted", file=sys.stderr)
+            return
         from pgsd_nerfstudio.plugin.known_errors import explained
 
         sentence = str(error) if isinstance(error, SceneError | RunError) else explained(error, traceback)
