@@ -40,7 +40,7 @@ def test_each_frame_of_the_weather_is_shown_once_at_its_own_rate(trained: Path, 
     assert render(trained, tmp_path / "v.mp4", "--width", 33) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'v.mp4'}\n"
     about, frames = video(tmp_path / "v.mp4")
-    assert (about["fps"], about["duration"], len(frames), about["size"]) == (25.0, FRAMES / 25, FRAMES, (32, 32))
+    assert (about["fps"], about["duration"], len(frames), about["size"]) == (25.0, FRAMES / 25, FRAMES, (32, 22))
     assert about["pix_fmt"].startswith("yuv420p") and about["codec"] == "h264"
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from pgsd_nerfstudio.cli.console import say
+from pgsd_nerfstudio.cli.picture_size import check_size, even_size
 from pgsd_nerfstudio.refusal import Refusal, refusing
 from pgsd_nerfstudio.weather.options import FLAT, MOST_FRAMES, SceneOptions
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.scene.cameras import Cameras
     from pgsd_nerfstudio.scene.scene import Scene
 
-LARGEST = 960  # pixels of the longer side, where nothing is asked for
+LONGEST = 960  # pixels of the longer side, where nothing is asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ class PathCommand:
             say(remark)
         with refusing(ValueError):
             cameras = self._cameras(scene, frames)
-            cameras = cameras.resized(*self._size(cameras))
+            cameras = cameras.resized(*even_size(cameras, self.width, self.height, LONGEST))
         with refusing(OSError):
             write_camera_path(self.output, cameras, self.fps)
         say(f"{frames} frames of {cameras.width}x{cameras.height}, {self.seconds:g} s; the whole weather passes along the path")
@@ -71,16 +72,12 @@ class PathCommand:
             value = getattr(self, name)
             if not 0 < value < float("inf"):
                 raise Refusal(f"--{name} must be positive, got {value:g}")
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if value is not None and not 16 <= value <= 8192:
-                raise Refusal(f"--{name} must lie in 16-8192, got {value}")
-        frames = max(1, round(self.seconds * self.fps)) if self.seconds * self.fps <= MOST_FRAMES else MOST_FRAMES + 1
-        if frames > MOST_FRAMES:
+        check_size(self.width, self.height)
+        if self.seconds * self.fps > MOST_FRAMES:
             raise Refusal(
                 f"--seconds {self.seconds:g} at --fps {self.fps:g} are more than {MOST_FRAMES:,} frames: use less of either"
             )
-        return frames
+        return max(1, round(self.seconds * self.fps))
 
     def _cameras(self, scene: Scene, frames: int) -> Cameras:
         from pgsd_nerfstudio.scene.camera_path import dolly_path, orbit_path, slow_path, still_path
@@ -92,14 +89,3 @@ class PathCommand:
         if self.kind == "still":
             return still_path(scene, frames=frames, view=self.view)
         return slow_path(scene, frames=frames, fps=self.fps, views=self.views)
-
-    def _size(self, cameras: Cameras) -> tuple[int, int]:
-        """Even sides, as videos want them: those asked for, the other in the shape of the training views."""
-        width, height = self.width, self.height
-        if width is None and height is None:
-            shrink = min(1.0, LARGEST / max(cameras.width, cameras.height))
-            width, height = round(cameras.width * shrink), round(cameras.height * shrink)
-        elif width is None or height is None:
-            given, ratio = width or height or 0, cameras.width / cameras.height
-            width, height = (given, round(given / ratio)) if height is None else (round(given * ratio), given)
-        return max(2, width // 2 * 2), max(2, height // 2 * 2)

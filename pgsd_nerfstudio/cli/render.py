@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pgsd_nerfstudio.cli.console import console, say
+from pgsd_nerfstudio.cli.picture_size import check_size, even_size
 from pgsd_nerfstudio.refusal import Refusal, refusing
 
 if TYPE_CHECKING:
@@ -32,9 +33,9 @@ class Render:
     output: Path = Path("render.mp4")
     """Where the video goes."""
     width: int | None = None
-    """Width in pixels; by default that of the camera path or of the training views."""
+    """Width in pixels; by default in the shape of the camera path or of the training views."""
     height: int | None = None
-    """Height in pixels; by default that of the camera path or of the training views."""
+    """Height in pixels; as --width."""
 
     def run(self) -> int:
         from rich.progress import track
@@ -48,7 +49,7 @@ class Render:
         with refusing(ValueError):
             weather = open_run(self.load_config)
             cameras, frames, fps = self._path(weather)
-            cameras = cameras.resized(self.width or cameras.width, self.height or cameras.height)
+            cameras = cameras.resized(*even_size(cameras, self.width, self.height))
         shown = track(range(len(frames)), "rendering", console=console(), transient=True)
 
         def picture(index: int) -> Tensor:
@@ -83,10 +84,7 @@ class Render:
     def _check(self) -> None:
         if self.output.suffix.lower() != ".mp4":
             raise Refusal(f"--output must end in .mp4, got {self.output}")
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if value is not None and not 16 <= value <= 8192:
-                raise Refusal(f"--{name} must lie in 16-8192, got {value}")
+        check_size(self.width, self.height)
         try:
             self.output.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
