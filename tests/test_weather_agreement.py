@@ -171,6 +171,14 @@ def test_a_splat_of_inria_s_trainer_with_what_ns_process_data_wrote_is_put_right
     assert "turned by applied_transform once more" in scene.remarks[-1] and looks_right(scene, capture) > 40
 
 
+def test_cameras_that_are_slightly_off_are_doubted(capture, tmp_path):
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
+    poses = TILT @ turn @ torch.linalg.inv(TILT) @ poses_of(capture)
+    scene = load_scene(capture / "splat.ply", in_other_coordinates(capture, tmp_path / "data", **as_frames(capture, poses)))
+    assert scene.remarks[-1].endswith("but not quite: are these the cameras that the splat was trained on?")
+
+
 @pytest.mark.parametrize("how", ["turned", "scaled", "shifted", "mixed up"])
 def test_cameras_that_fit_nowhere_are_refused_with_what_was_tried(capture, tmp_path, how):
     poses = poses_of(capture)

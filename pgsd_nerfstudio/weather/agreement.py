@@ -26,7 +26,8 @@ from pgsd_nerfstudio.scene.scene import Scene, SceneError
 VIEWS = 5  # that are compared
 SIDE = 160  # pixels along the longer side
 FINE, COARSE = 2.0, 12.0  # standard deviations of the two blurs in pixels of SIDE
-AGREES = 0.4  # median correlation from which on cameras are right
+AGREES = 0.4  # median correlation from which on cameras count as right: poor splats of right cameras have 0.5
+DOUBTED = 0.6  # below that, cameras may be turned by some degrees, and it is said so
 LEAST_CONTRAST = 0.01  # between the blurs; a plain wall tells nothing
 LEAST_COVERED = 0.02  # of the picture that the splat must cover
 
@@ -40,6 +41,20 @@ class Likeness:
     psnr: float
     """In dB."""
     views: int
+
+
+def likeness_of(scene: Scene, rasterizer: Rasterizer, device: torch.device) -> Likeness | None:
+    """How much renders of some views look like their photographs; None where there are none that show something.
+
+    Args:
+        scene: its cameras are taken as they are.
+        rasterizer: of its Gaussians.
+        device: of the rasterizer.
+
+    Raises:
+        SceneError: a photograph cannot be read.
+    """
+    return _compared(scene, _photographs(scene), rasterizer, device)
 
 
 def agreed(scene: Scene, rasterizer: Rasterizer, device: torch.device) -> Scene:
@@ -58,11 +73,13 @@ def agreed(scene: Scene, rasterizer: Rasterizer, device: torch.device) -> Scene:
     if scene.trusted:
         return scene
     photographs = _photographs(scene)
-    found = _likeness(scene, photographs, rasterizer, device)
+    found = _compared(scene, photographs, rasterizer, device)
     if found is None:
         return scene
     if found.correlation >= AGREES:
         said = f"renders of {found.views} views look like their photographs ({_told(found)})"
+        if found.correlation < DOUBTED:
+            said += ", but not quite: are these the cameras that the splat was trained on?"
         return replace(scene, trusted=True, placements=(), remarks=(*scene.remarks, said))
     best: tuple[Likeness, Scene, str] | None = None
     for placement in scene.placements:
@@ -70,7 +87,7 @@ def agreed(scene: Scene, rasterizer: Rasterizer, device: torch.device) -> Scene:
             elsewhere = scene.placed(placement)
         except (ValueError, RuntimeError):  # no metric frame follows from cameras there
             continue
-        likeness = _likeness(elsewhere, photographs, rasterizer, device)
+        likeness = _compared(elsewhere, photographs, rasterizer, device)
         if likeness is not None and (best is None or likeness.correlation > best[0].correlation):
             best = likeness, elsewhere, placement.name
     if best is not None and best[0].correlation >= AGREES:
@@ -113,7 +130,7 @@ def _photographs(scene: Scene) -> list[Picture]:
     return found
 
 
-def _likeness(scene: Scene, photographs: list[Picture], rasterizer: Rasterizer, device: torch.device) -> Likeness | None:
+def _compared(scene: Scene, photographs: list[Picture], rasterizer: Rasterizer, device: torch.device) -> Likeness | None:
     """None where there is nothing to compare."""
     if not photographs:
         return None
