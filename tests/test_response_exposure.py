@@ -91,10 +91,17 @@ def test_mass_comes_down_at_the_speeds_of_the_sizes_that_carry_it():
 
 
 def test_gaussians_under_the_ground_belong_to_it_and_those_in_the_air_do_not():
-    found = Exposure.of(flat_at(torch.tensor([[0.0, 0, -0.3], [0.0, 0, 0.7], [0.0, 0, -0.9]])), mesh(GROUND), CALM)
-    assert found.loose.tolist() == [False, True, True]
-    assert found.catches[0] == pytest.approx(1.0, abs=1e-5) and 0 < found.catches[1] < 0.7
-    assert found.catches[2] == 0  # deep below: sheltered by the ground itself
+    """The ground lets light through to Gaussians deep below it; they show the mulch on it, and that gets the snow."""
+    found = Exposure.of(flat_at(torch.tensor([[0.0, 0, -0.3], [0.0, 0, -1.4], [0.0, 0, 0.7]])), mesh(GROUND), CALM)
+    assert found.loose.tolist() == [False, False, True]
+    assert found.catches[:2] == pytest.approx([1.0, 1.0], abs=1e-5) and 0 < found.catches[2] < 0.7
+
+
+def test_what_stands_under_a_table_is_no_part_of_it():
+    table = quad([(-1.0, -1, 0.8), (1, -1, 0.8), (1, 1, 0.8), (-1, 1, 0.8)])
+    found = Exposure.of(flat_at(torch.tensor([[0.0, 0, 0.15], [0.0, 0, -1.4], [0.0, 0, 0.75]])), mesh(GROUND, table), CALM)
+    assert found.loose.tolist() == [True, False, False]
+    assert found.catches.tolist() == [0.0, 0.0, pytest.approx(1.0, abs=1e-5)]
 
 
 def test_without_a_surface_everything_is_loose_and_open():

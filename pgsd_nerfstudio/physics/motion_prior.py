@@ -10,6 +10,7 @@ import numpy as np
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import Clock, Domain, domain_of
+from pgsd_nerfstudio.physics.ground.lowest import down_to_ground
 from pgsd_nerfstudio.physics.metric import MAX_PARTICLES, console, simulate_metric
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import cache_dir, content_key
@@ -56,6 +57,8 @@ def motion_prior(
         ValueError: see `simulate_metric` and `paper.simulate_paper`.
     """
     domain = domain_of(scene)
+    if profile == "metric":
+        domain = down_to_ground(domain, surface)
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
     cameras = None if everything else scene.frame.cameras_to_metric(scene.cameras)
     parts = (effect.emission, effect.material, effect.wind, effect.timeline, effect.surface, effect.dense)

@@ -25,7 +25,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 RAYS = 24  # per Gaussian for mass, and as many for the sky; their noise of a tenth is less than the difference of neighbours
 NEAR = 0.08  # m; a Gaussian this close to the surface is part of it
-SUNK = 0.5  # m; Gaussians this far below the ground still belong to it, since those above let light through
+SUNK = 0.5  # m; Gaussians this far below a surface still belong to it, since those above let light through
 OFF = 0.03  # m; rays start this far off the surface, since captures are rough by as much
 LOOSE_CATCH = 0.4  # mass that leaves, blades and branches catch; on average they turn half of their area to the sky
 LOOSE_MOST = 0.7  # share of them that a cover can hide
@@ -110,15 +110,17 @@ def _ground(
     """The start of the rays of each Gaussian, its normal, whether it is loose, and its level."""
     up = torch.tensor([0.0, 0.0, 1.0])
     found = surface.closest(metric.means)
-    loose = ~(found.distance < NEAR) & ~_beneath(metric.means, surface)
+    sunk, buried, above = _beneath(metric.means, surface)
+    loose = ~(found.distance < NEAR) & ~sunk & ~buried
     order = metric.scales.sort(dim=1)
     axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
     own = axes.gather(2, order.indices[:, :1, None].expand(-1, 3, 1))[:, :, 0]
     own = own * torch.where(own[:, 2:] < 0, -1.0, 1.0)
     flat = order.values[:, 0] < FLAT * order.values[:, 1]
     apart = torch.where(flat[:, None], own, up)
-    normals = torch.where(loose[:, None], apart, found.normals)
+    normals = torch.where(loose[:, None], apart, torch.where(buried[:, None], up, found.normals))
     starts = torch.where(loose[:, None], metric.means + OFF * up, found.points + OFF * found.normals)
+    starts = torch.where(buried[:, None], above + OFF * up, starts)
     cosine = (own * normals).sum(1)
     level = torch.where(loose | ~flat, UNEVEN, cosine.square())
     # The mesh of a capture is rough by its voxels; the normals of level Gaussians are more exact.
@@ -126,7 +128,19 @@ def _ground(
     return starts, torch.where((level > LEVEL)[:, None], turned, normals), loose, level
 
 
-def _beneath(points: Float[Tensor, "n 3"], surface: SurfaceMesh) -> Bool[Tensor, " n"]:
-    """Whether a point is shortly below the back of the surface, where a Gaussian fills what a camera sees as the surface."""
-    hits = surface.cast(points, torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3))
-    return torch.isfinite(hits.distance) & (hits.distance < SUNK) & (hits.normal[:, 2] > 0)
+def _beneath(
+    points: Float[Tensor, "n 3"], surface: SurfaceMesh
+) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"], Float[Tensor, "n 3"]]:
+    """Which points are shortly below the back of the surface, where a Gaussian fills what a camera sees as the surface.
+
+    Returns:
+        Those points; the points that are farther below the ground, which is a surface with nothing below it: the Gaussians
+        there shine through it and are seen as a part of it, while those under a table are not part of the table; and the place
+        of the surface above each point.
+    """
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
+    hits = surface.cast(points, up)
+    under = torch.isfinite(hits.distance) & (hits.normal[:, 2] > 0)
+    sunk = under & (hits.distance < SUNK)
+    buried = under & ~sunk & torch.isinf(surface.cast(points, -up).distance)
+    return sunk, buried, points + torch.where(under, hits.distance, 0.0)[:, None] * up

@@ -30,7 +30,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
 MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
-_REVISION = 2  # of the computation; stored answers of another revision are not used
+_REVISION = 3  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
