@@ -57,7 +57,7 @@ def test_the_same_preview_twice_is_the_same_picture(yard, tmp_path):
         ({"effect": "hail"}, "known are: "),
         ({"frames": 0}, "--frames must be positive, got 0"),
         ({"fps": "nan"}, "--fps must be positive, got nan"),
-        ({"width": 8}, "at least 16x16 pixels, got 8x64"),
+        ({"width": 8}, "--width must lie in 16-8192, got 8"),
         ({"output": "v.avi"}, "--output must end in .mp4, got v.avi"),
         ({"start": -1}, "--start must not be negative, got -1 s"),
         ({"start": 0.9}, "4 frames from --start 0.9 s go beyond the end of the weather at 1 s"),
@@ -74,6 +74,18 @@ def test_bad_input_gets_one_sentence_and_exit_code_1(yard, tmp_path, capsys, mon
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pgsd: ")]
     assert len(said) == 1 and sentence in said[0]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"), [((None, None), (640, 426)), ((100, None), (100, 66)), ((None, 50), (74, 50)), ((64, 64), (64, 64))]
+)
+def test_a_preview_has_the_shape_of_the_capture_unless_another_is_asked_for(yard, tmp_path, asked, size):
+    """The views of the yard have 96 x 64 pixels. Sides are even, so that every player shows 4:2:0."""
+    sides = dict(zip(("width", "height"), asked, strict=True))
+    assert preview(yard, tmp_path / "v.mp4", frames=1, **sides, **{"max-particles": 50}) == 0
+    about = next(imageio_ffmpeg.read_frames(str(tmp_path / "v.mp4")))
+    assert about["size"] == size and about["pix_fmt"].startswith("yuv420p")
+    assert Image.open(tmp_path / "v.png").size == size
 
 
 def test_a_video_is_no_longer_than_its_weather(yard, tmp_path, capsys):

@@ -9,11 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
 from pgsd_nerfstudio.cli.console import console, say
+from pgsd_nerfstudio.cli.picture_size import check_size, even_size
 from pgsd_nerfstudio.refusal import Refusal, refusing
 from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from pgsd_nerfstudio.scene.cameras import Cameras
+
+LONGEST = 640  # pixels of the longer side, where nothing is asked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,10 +30,11 @@ class Preview(WeatherCommand):
     """Where the video goes; its last frame goes beside it as .png."""
     frames: int = 50
     """Length of the video in frames; a weather that has fewer is shown as a whole."""
-    width: int = 640
-    """Width in pixels."""
-    height: int = 360
-    """Height in pixels."""
+    width: int | None = None
+    """Width in pixels; by default the shape of the training views, with 640 pixels on the longer side. What does not fit a
+    shape that is given is cropped."""
+    height: int | None = None
+    """Height in pixels; as --width."""
     start: float | None = None
     """First second to show; by default the last ones are shown, when the most has gathered."""
     views: tuple[int, int] | None = None
@@ -51,7 +57,7 @@ class Preview(WeatherCommand):
         self._make_folder()
         with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
             weather = make_weather(prepare_scene(scene), effect, self.simulation, edited_images=self.answer.edited_images)
-        cameras = path.resized(self.width, self.height)
+        cameras = path.resized(*self._size(path))
 
         def picture(index: int) -> Tensor:
             return weather.render_frame(cameras[index], self._first + index).rgb
@@ -70,12 +76,9 @@ class Preview(WeatherCommand):
         return 0
 
     def _check(self) -> None:
-        for name in ("frames", "width", "height"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise Refusal(f"--{name} must be positive, got {value:g}")
-        if min(self.width, self.height) < 16:
-            raise Refusal(f"a video needs at least 16x16 pixels, got {self.width}x{self.height}")
+        if not self.frames > 0:
+            raise Refusal(f"--frames must be positive, got {self.frames:g}")
+        check_size(self.width, self.height)
         if self.output.suffix.lower() != ".mp4":
             raise Refusal(f"--output must end in .mp4, got {self.output}")
         if self.start is not None and not self.start >= 0:
@@ -91,6 +94,13 @@ class Preview(WeatherCommand):
             )
         if self._shown < self.frames:
             say(f"the weather has {simulation.frames} frames: the video shows all of them, not {self.frames}")
+
+    def _size(self, cameras: Cameras) -> tuple[int, int]:
+        """Width and height of the pictures."""
+        width, height = self.width, self.height
+        if width is None and height is None:
+            width, height = (LONGEST, None) if cameras.width >= cameras.height else (None, LONGEST)
+        return even_size(cameras, width, height)
 
     def _make_folder(self) -> None:
         """The folder of the output, before anything costly is done."""
