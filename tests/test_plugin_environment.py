@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,6 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.plugin import environment
-from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.scene.scene import SceneError
 
 
 def test_an_ffmpeg_is_offered_where_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -36,30 +33,3 @@ def test_checkpoints_with_numpy_scalars_can_be_loaded(tmp_path: Path):
     environment.allow_numpy_scalars()
     torch.save({"lr": np.float64(0.25)}, tmp_path / "step.ckpt")
     assert torch.load(tmp_path / "step.ckpt")["lr"] == 0.25
-
-
-@pytest.mark.parametrize("error", [SceneError("no scene at x"), RunError("the motion prior is missing")])
-def test_errors_that_are_sentences_leave_without_a_traceback(
-    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-):
-    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
-    environment._show_sentences()
-    sys.excepthook(type(error), error, None)
-    assert capsys.readouterr().err == f"pgsd-weather: {error}\n"
-
-
-def test_an_interrupted_command_ends_without_a_traceback_and_with_130():
-    program = "import os, signal, time, pgsd_nerfstudio.plugin.environment as e; e._show_sentences()"
-    waiting = f"{program}; os.kill(os.getpid(), signal.SIGINT); time.sleep(30)"
-    done = subprocess.run(["bash", "-c", f"{sys.executable} -c '{waiting}'; exit $?"], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "interrupted\n")
-
-
-def test_other_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
-    shown = []
-    monkeypatch.setattr(sys, "excepthook", lambda *found: shown.append(found))
-    environment._show_sentences()
-    environment._show_sentences()
-    error = ValueError("a bug")
-    sys.excepthook(ValueError, error, None)
-    assert shown == [(ValueError, error, None)]

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +12,8 @@ from plugin_scene import tiny_config, train, write_scene
 
 from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.known_errors import explained
+from pgsd_nerfstudio.plugin.known_errors import explained, show_sentences
+from pgsd_nerfstudio.scene.scene import SceneError
 from pgsd_nerfstudio.version import __version__
 
 
@@ -156,3 +159,33 @@ def test_errors_of_other_methods_are_not_ours(tmp_path: Path):
     (tmp_path / "config.yml").write_text("!!python/object:gone.Config {method_name: nerfacto}")
     assert said(RenderInterpolated(tmp_path / "config.yml").main) is None
     assert explained(ValueError("a bug"), None) is None
+
+
+# What leaves the process.
+
+
+@pytest.mark.parametrize("error", [SceneError("no scene at x"), RunError("the motion prior is missing")])
+def test_errors_that_are_sentences_leave_without_a_traceback(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    show_sentences()
+    sys.excepthook(type(error), error, None)
+    assert capsys.readouterr().err == f"pgsd-weather: {error}\n"
+
+
+def test_an_interrupted_command_ends_without_a_traceback_and_with_130():
+    program = "import os, signal, time, pgsd_nerfstudio.plugin.known_errors as e; e.show_sentences()"
+    waiting = f"{program}; os.kill(os.getpid(), signal.SIGINT); time.sleep(30)"
+    done = subprocess.run(["bash", "-c", f"{sys.executable} -c '{waiting}'; exit $?"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+def test_other_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
+    shown = []
+    monkeypatch.setattr(sys, "excepthook", lambda *found: shown.append(found))
+    show_sentences()
+    show_sentences()
+    error = ValueError("a bug")
+    sys.excepthook(ValueError, error, None)
+    assert shown == [(ValueError, error, None)]

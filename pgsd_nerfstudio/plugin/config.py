@@ -20,6 +20,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from rich.console import Console
 
 from pgsd_nerfstudio.plugin.environment import prepare
+from pgsd_nerfstudio.plugin.known_errors import show_sentences
 from pgsd_nerfstudio.plugin.options import RunOptions, check_version
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipelineConfig
 from pgsd_nerfstudio.plugin.resuming import resumed
@@ -28,6 +29,7 @@ from pgsd_nerfstudio.plugin.training_options import CUDA
 from pgsd_nerfstudio.weather.options import FLAT
 
 prepare()
+show_sentences()
 
 THIS_MACHINE = "127.0.0.1"
 
@@ -137,6 +139,7 @@ class WeatherTrainerConfig(TrainerConfig):
         given = self.__dict__.get("viewer") if name == "viewer" else None
         if given is not None and value.websocket_host == ViewerConfig().websocket_host and not _names_host(sys.argv):
             value = replace(value, websocket_host=given.websocket_host)
+            _say(f"the viewer listens on {value.websocket_host}; --viewer.websocket-host names another address")
         super().__setattr__(name, value)
 
 

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import torch
 
 from pgsd_nerfstudio.refusal import Refusal
-from pgsd_nerfstudio.scene.scene import SceneError
 from pgsd_nerfstudio.storage import cache_dir
 
 
@@ -24,10 +21,9 @@ class RunError(Refusal):
 
 
 def prepare() -> None:
-    """Allow nerfstudio's own checkpoints, offer an ffmpeg, show bad input as a sentence."""
+    """Allow nerfstudio's own checkpoints, offer an ffmpeg."""
     allow_numpy_scalars()
     _offer_ffmpeg()
-    _show_sentences()
 
 
 def allow_numpy_scalars() -> None:
@@ -56,26 +52,3 @@ def _offer_ffmpeg() -> None:
     except (OSError, RuntimeError):
         return  # ns-render then says itself that it misses ffmpeg; nothing else needs it
     os.environ["PATH"] = f"{os.environ.get('PATH', '')}{os.pathsep}{folder}"
-
-
-def _show_sentences() -> None:
-    """Errors that are sentences for the user leave a process as such, without the traceback of nerfstudio's launcher."""
-    shown_before = sys.excepthook
-    if getattr(shown_before, "shows_sentences", False):
-        return
-
-    def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, KeyboardInterrupt) and not os.environ.get("PGSD_TRACEBACK"):
-            # Python then ends the process with 130, unless anything is imported here: that makes it forget the interruption.
-            print("interrupted", file=sys.stderr)
-            return
-        from pgsd_nerfstudio.plugin.known_errors import explained
-
-        sentence = str(error) if isinstance(error, SceneError | RunError) else explained(error, traceback)
-        if sentence is None or os.environ.get("PGSD_TRACEBACK"):
-            shown_before(kind, error, traceback)
-        else:
-            print(f"pgsd-weather: {sentence}", file=sys.stderr)
-
-    show.shows_sentences = True  # type: ignore[attr-defined]
-    sys.excepthook = show

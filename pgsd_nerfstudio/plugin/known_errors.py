@@ -6,6 +6,8 @@ name the file. The traceback of such an error still holds which one was being re
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -17,6 +19,27 @@ from pgsd_nerfstudio.scene.run_config import entry, read_run_config
 from pgsd_nerfstudio.scene.scene import SceneError
 
 METHOD = "pgsd-weather"
+
+
+def show_sentences() -> None:
+    """Errors that are sentences for the user leave a process as such, without the traceback of nerfstudio's launcher."""
+    shown_before = sys.excepthook
+    if getattr(shown_before, "shows_sentences", False):
+        return
+
+    def show(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if isinstance(error, KeyboardInterrupt) and not os.environ.get("PGSD_TRACEBACK"):
+            # Python then ends the process with 130, unless anything is imported here: that makes it forget the interruption.
+            print("interrupted", file=sys.stderr)
+            return
+        sentence = str(error) if isinstance(error, SceneError | RunError) else explained(error, traceback)
+        if sentence is None or os.environ.get("PGSD_TRACEBACK"):
+            shown_before(kind, error, traceback)
+        else:
+            print(f"pgsd-weather: {sentence}", file=sys.stderr)
+
+    show.shows_sentences = True  # type: ignore[attr-defined]
+    sys.excepthook = show
 
 
 def explained(error: BaseException, traceback: TracebackType | None) -> str | None:
