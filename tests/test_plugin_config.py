@@ -71,7 +71,7 @@ def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture
     ("flags", "sentence"),
     [
         (["--load-scene", "nowhere.ply"], "no scene at"),
-        (["--load-scene", "demo", "--data", "nowhere"], "no data at"),
+        (["--load-scene", "demo", "--data", "nowhere"], "the demo has cameras of its own: leave --data"),
         (["--load-scene", "demo", "--effect", "hail"], "there is no effect 'hail'; known are: "),
         (["--load-scene", "demo", "--intensity", "-1"], "intensity must lie in 0.01-100 mm/h"),
         (["--load-scene", "demo", "--size", "9"], "--size must lie in 0.2-5, got 9"),
