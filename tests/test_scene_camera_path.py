@@ -1,5 +1,6 @@
 """Laws of camera paths: calm, between views that see the middle, the same whichever part is asked for; around, ahead, still."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -49,6 +50,20 @@ def test_the_two_views_look_at_the_middle_and_are_25_degrees_apart():
     assert first % 2 == 1 and last % 2 == 1
     turn = angle(poses[first, :3, :3], poses[last, :3, :3])
     assert 19 < turn < 31
+
+
+def test_the_two_views_have_what_all_look_at_in_the_middle_and_not_the_ground_below_it():
+    """A statue whose face is 2.2 m above the ground; a few views look at its feet."""
+    target = torch.tensor([0.0, 0.0, 1.2])
+    poses = ring(48, height=1.5 + 4.0 * math.tan(math.radians(20)))[torch.arange(40)].opengl()
+    feet = ring(48, height=1.5).opengl()
+    poses[:, :3, 3] += target  # they look at 2.2 m, 20 degrees down
+    poses[::4] = feet[:40:4]
+    poses[::4, :3, 3] -= torch.tensor([0.0, 0.0, 1.0])
+    cameras = Cameras.from_opengl(poses, ring(40).Ks, 128, 96)
+    for view in choose_views(cameras, STILL_WORLD):
+        x, y, z = cameras.viewmats[view, :3, :3] @ torch.tensor([0.0, 0.0, 2.2]) + cameras.viewmats[view, :3, 3]
+        assert z > 0 and abs(x / z) < 0.02 and abs(y / z) < 0.02
 
 
 def test_the_choice_of_views_does_not_depend_on_the_scenes_own_axes():

@@ -34,7 +34,8 @@ def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
     poses = cameras.opengl()
     centers = frame.to_metric(poses[:, :3, 3])
     forward = torch.nn.functional.normalize(-frame.vectors_to_metric(poses[:, :3, 2]), dim=1)
-    aside = torch.rad2deg(torch.arccos((torch.nn.functional.normalize(-centers, dim=1) * forward).sum(1).clamp(-1.0, 1.0)))
+    to_middle = torch.nn.functional.normalize(_looked_at(centers, forward) - centers, dim=1)
+    aside = torch.rad2deg(torch.arccos((to_middle * forward).sum(1).clamp(-1.0, 1.0)))
     rotations = poses[:, :3, :3]
     turn = torch.rad2deg(roma.rotmat_geodesic_distance(rotations[:, None], rotations[None, :]))
     slope = (torch.rad2deg(torch.arcsin(-forward[:, 2].clamp(-1.0, 1.0))) - SLOPE).abs()
@@ -94,10 +95,7 @@ def orbit_path(scene: Scene, *, frames: int, degrees: float = 360.0) -> Cameras:
         raise ValueError(
             f"the training views stand {radius:.2g} m from the middle of the scene: an orbit needs views around it"
         )
-    # Where each line of sight passes nearest to the vertical through the middle.
-    ahead = -(centers[:, :2] * forward[:, :2]).sum(1) / forward[:, :2].square().sum(1).clamp_min(1e-6)
-    seen = (centers[:, 2] + ahead * forward[:, 2])[ahead > 0]
-    target = torch.tensor([0.0, 0.0, float(seen.median()) if len(seen) else 0.0], dtype=torch.float64)
+    target = _looked_at(centers, forward)
     nearest = int(((away - radius).abs() + (centers[:, 2] - height).abs()).argmin())
     start = torch.atan2(centers[nearest, 1], centers[nearest, 0])
     closed = math.isclose(abs(degrees) % 360.0, 0.0)
@@ -152,6 +150,16 @@ def _view(scene: Scene, view: int | None) -> int:
     if view is not None and not 0 <= view < len(scene.cameras):
         raise ValueError(f"the view must lie in 0-{len(scene.cameras) - 1}, the training views of this scene, got {view}")
     return choose_views(scene.cameras, scene.frame)[0] if view is None else view
+
+
+def _looked_at(centers: Tensor, forward: Tensor) -> Tensor:
+    """The metric point [3] over the middle that views at centres [t, 3] along directions [t, 3] look at.
+
+    It is where most lines of sight pass nearest to the vertical through the middle; the ground if none comes near.
+    """
+    ahead = -(centers[:, :2] * forward[:, :2]).sum(1) / forward[:, :2].square().sum(1).clamp_min(1e-6)
+    seen = (centers[:, 2] + ahead * forward[:, 2])[ahead > 0]
+    return torch.tensor([0.0, 0.0, float(seen.median()) if len(seen) else 0.0], dtype=centers.dtype, device=centers.device)
 
 
 def _from_metric(scene: Scene, centers: Tensor, forward: Tensor, K: Tensor) -> Cameras:
