@@ -80,6 +80,8 @@ def test_help_shows_every_flag_once_and_none_twice(capsys: pytest.CaptureFixture
         (["--load-scene", "demo", "--weather", "bliss"], "'bliss' names nothing that could be in the air"),
         (["--load-scene", "demo", "--llm", "openai:x"], "--llm openai:x needs words to ask about"),
         (["--load-scene", "demo", "--seconds", "0"], "--seconds must be positive"),
+        # As Python says it, test_response_edited: one sentence for both.
+        (["--load-scene", "demo", "--edited-images", "no"], "edited pictures must be in a folder, but no does not exist"),
         (["--load-scene", "demo", "--export-time", "2"], "--export-time must lie in 0-1"),
     ],
 )

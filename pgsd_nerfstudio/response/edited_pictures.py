@@ -22,6 +22,20 @@ Picture = tuple[int, UInt8[Tensor, "h w 3"]]
 console = Console(stderr=True, highlight=False)
 
 
+def edited_folder(folder: Path) -> Path:
+    """The folder of edited pictures, with the user's home in place of ~.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise ValueError(
+            f"edited pictures must be in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
+        )
+    return folder
+
+
 def read_edited(folder: Path, scene: Scene) -> list[Picture]:
     """Read the edited pictures in a folder.
 
@@ -40,11 +54,7 @@ def read_edited(folder: Path, scene: Scene) -> list[Picture]:
     Raises:
         ValueError: the folder is missing, no picture in it belongs to a view, a picture cannot be read, or two show one view.
     """
-    folder = Path(folder).expanduser()
-    if not folder.is_dir():
-        raise ValueError(
-            f"edited pictures must be in a folder, but {folder} {'is a file' if folder.exists() else 'does not exist'}"
-        )
+    folder = edited_folder(folder)
     kinds = Image.registered_extensions()
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in kinds and not p.name.startswith(".") and p.is_file())
     found: dict[int, Path] = {}

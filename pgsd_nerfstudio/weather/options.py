@@ -170,8 +170,10 @@ class AnswerOptions:
         Raises:
             ValueError: there is no such folder.
         """
-        if self.edited_images is not None and not self.edited_images.is_dir():
-            raise ValueError(f"--edited-images must be a folder of edited training views, found none at {self.edited_images}")
+        if self.edited_images is not None:
+            from pgsd_nerfstudio.response.edited_pictures import edited_folder
+
+            edited_folder(self.edited_images)
 
 
 ARGUMENT = re.compile(r"(?<![\w./-])(data|metres_per_unit|up|camera|trust_cameras)=('(\w+)'|True)?")
