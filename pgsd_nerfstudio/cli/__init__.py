@@ -1,1 +1,1 @@
-"""The commands of `pgsd`: preview, simulate, doctor, cache, bench and verify. Training and viewing are nerfstudio's."""
+"""The commands of `pgsd`: preview, simulate, path, render, doctor, cache, bench, verify. Training and viewing are nerfstudio's."""
