@@ -114,9 +114,10 @@ def test_fisheyes_are_known_by_their_own_frame(tmp_path):
     lenses = [photograph.lens for photograph in capture.photographs]
     assert [lens.projection for lens in lenses] == ["perspective", "perspective", "fisheye", "fisheye"]
     assert [lens.radial for lens in lenses] == [(0.02,), (0.02,), (0.1,), (0.0, 0.3)]
-    assert {photograph.lens.projection for photograph in read(tmp_path, camera_model=None, is_fisheye=True).photographs} == {
-        "fisheye"
-    }
+    own = read(tmp_path, frames=frames, camera_model="SIMPLE_RADIAL")  # against that of the whole file
+    assert [photograph.lens.projection for photograph in own.photographs][2:] == ["fisheye", "fisheye"]
+    whole = read(tmp_path, camera_model=None, is_fisheye=True)
+    assert {photograph.lens.projection for photograph in whole.photographs} == {"fisheye"}
     for model in ("EQUIRECTANGULAR", "FISHEYE624"):
         with pytest.raises(SceneError, match=rf"the lens of images/0\.jpg was taken with a {model} camera"):
             read(tmp_path, camera_model=model)
@@ -212,6 +213,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"k1": math.nan}, r"expected k1 from"),
     ({"camera_model": 7}, r"needs a camera_model such as OPENCV, found '7'"),
     ({"camera_model": "BOX"}, r"was taken with a BOX camera"),
+    ({"camera_model": "FOV"}, r"is of the model FOV, which no transforms\.json describes: pass COLMAP's folder"),
     ({"applied_transform": [[1, 2]]}, r"applied_transform must be a 3x4 matrix"),
     ({"applied_transform": np.zeros((3, 4)).tolist()}, r"applied_transform must be invertible"),
     ({"applied_scale": "big"}, r"applied_scale a number"),

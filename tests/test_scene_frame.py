@@ -201,3 +201,15 @@ def test_the_garden_stands_on_its_paving(garden_ply, garden_data):
 
 def _plain(gaussians: Gaussians) -> Gaussians:
     return Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors[:, 0])
+
+
+def test_cameras_that_stand_on_the_ground_give_no_scale():
+    """So far away that double precision knows no height above the ground; a scale that is given is taken."""
+    cameras = round_of(12, 2.5, 1.2)
+    rotation = cameras.viewmats[:, :3, :3]
+    viewmats = cameras.viewmats.clone()
+    viewmats[:, :3, 3] -= rotation @ torch.tensor([0.0, 0.0, 1e20])
+    far = Cameras(viewmats, cameras.Ks, cameras.width, cameras.height)
+    with pytest.raises(ValueError, match="the cameras stand on the ground, which gives no scale"):
+        estimate_frame(far, Gaussians.empty(), up=(0.0, 0.0, 1.0))
+    assert estimate_frame(far, Gaussians.empty(), metres_per_unit=2.0, up=(0.0, 0.0, 1.0)).metres_per_unit == 2.0

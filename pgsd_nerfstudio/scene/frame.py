@@ -145,7 +145,7 @@ def estimate_frame(
         up: direction in scene axes, of any length. None: it is estimated from the way the cameras were held.
 
     Raises:
-        ValueError: there are no cameras, `metres_per_unit` is not positive, or `up` is no direction.
+        ValueError: there are no cameras, they stand on the ground, `metres_per_unit` is not positive, or `up` is no direction.
     """
     if len(cameras) == 0:
         raise ValueError("a frame needs at least one camera, found none")
@@ -160,6 +160,8 @@ def estimate_frame(
     ground, ground_source = ground_level(gaussians, upward, middle, radius, camera_height)
     height = float(camera_height - ground)
     if metres_per_unit is None:
+        if not 0 < height < math.inf:
+            raise ValueError("the cameras stand on the ground, which gives no scale")
         metres_per_unit = CAMERA_HEIGHT / height
         scale_source = f"scale from cameras taken as {CAMERA_HEIGHT} m above the ground"
     else:

@@ -25,6 +25,8 @@ from pgsd_nerfstudio.scene.errors import SceneError
 DISTORTION: tuple[str, ...] = ("k1", "k2", "k3", "k4", "p1", "p2")
 """In the order of distortion_params."""
 ALIASES = {"PERSPECTIVE": "OPENCV"}
+UNWRITTEN = ("FULL_OPENCV", "THIN_PRISM_FISHEYE", "FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
+"""Models for whose parameters a transforms.json has no names."""
 MOST_BYTES = 500_000_000
 
 
@@ -131,6 +133,8 @@ def _model(meta: Mapping[str, Any], frame: Mapping[str, Any], whose: str) -> str
         if model is not None:
             if not isinstance(model, str):
                 raise SceneError(f"{whose} needs a camera_model such as OPENCV, found {str(model)[:40]!r}")
+            if model in UNWRITTEN:
+                raise SceneError(f"{whose} is of the model {model}, which no transforms.json describes: pass COLMAP's folder")
             return ALIASES.get(model, model)
         if names.get("is_fisheye"):
             return "OPENCV_FISHEYE"
