@@ -1,1 +1,1 @@
-"""The commands of `pgsd`: preview, simulate, path, render, doctor, cache, bench, verify. Training and viewing are nerfstudio's."""
+"""The commands of `pgsd`, one a module. Training and viewing are nerfstudio's."""
