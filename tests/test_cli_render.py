@@ -83,6 +83,16 @@ def test_nothing_in_the_files_of_a_run_is_run(trained: Path, tmp_path: Path, cap
     assert not evidence.exists()
 
 
+def test_opening_a_run_asks_no_language_model(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A file from elsewhere would name the address that the user's key is sent to."""
+    monkeypatch.setattr("pgsd_nerfstudio.effects.options.EffectOptions.understand", None)
+    copy = Path(shutil.copytree(trained, tmp_path / "copy"))
+    changed(copy, "llm: null", "llm: openai:model")
+    changed(copy, "llm_url: null", "llm_url: http://127.0.0.1:1/v1")
+    changed(copy, "weather: null", "weather: purple snow")
+    assert render(copy, tmp_path / "v.mp4", "--width", 32) == 0
+
+
 def changed(copy: Path, old: str, new: str) -> None:
     text = (copy / "config.yml").read_text()
     assert old in text

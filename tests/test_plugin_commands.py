@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -41,7 +42,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     scene = "demo" if request.param == "demo" else request.getfixturevalue("splatfacto_run")
     folder = tmp_path_factory.mktemp("commands")
     said = succeed(folder, "ns-train", "pgsd-weather", "--load-scene", scene, "--experiment-name", "e2e", *SHORT)
-    assert "Training Finished" in said and "ns-viewer --load-config" in said
+    assert "Training Finished" in said and "ns-viewer --load-config" in said and "pgsd render --load-config" in said
     return folder
 
 
@@ -50,8 +51,29 @@ CONFIG = "outputs/e2e/pgsd-weather/now/config.yml"
 
 def test_interpolate_shows_weather_that_gathers(run: Path):
     flags = ["--interpolation-steps", "4", "--downscale-factor", "4", "--output-path", "interpolate.mp4"]
-    succeed(run, "ns-render", "interpolate", "--load-config", CONFIG, *flags)
-    assert imageio_ffmpeg.count_frames_and_secs(str(run / "interpolate.mp4"))[0] == 44
+    said = succeed(run, "ns-render", "interpolate", "--load-config", CONFIG, *flags)
+    assert "the whole weather passes along it" in " ".join(said.split())
+    assert imageio_ffmpeg.count_frames_and_secs(str(run / "interpolate.mp4"))[0] == 4 * (round(2.4 * 4) - 1)
+
+
+def test_a_moved_run_is_rendered_from_another_folder_at_its_own_rate(run: Path, tmp_path: Path):
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copytree((run / CONFIG).parent, tmp_path / "mine")
+    flags = ["--load-config", tmp_path / "mine", "--output", "v.mp4", "--width", "128"]
+    succeed(tmp_path / "elsewhere", "pgsd", "render", *flags)
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "elsewhere/v.mp4")) == (100, 4.0)
+    succeed(tmp_path / "elsewhere", "ns-eval", "--load-config", tmp_path / "mine/config.yml", "--output-path", "eval.json")
+
+
+def test_a_run_that_is_refused_leaves_nothing(run: Path, tmp_path: Path):
+    done = command(tmp_path, "ns-train", "pgsd-weather", "--load-scene", "demo", "--prior", "nothere")
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "pgsd-weather: there is no local folder nothere" in done.stderr
+    models = (run / CONFIG).parent / "nerfstudio_models"
+    flags = ["--load-scene", "demo", "--effect", "fog", "--steps", "9", "--load-dir", models]
+    done = command(tmp_path, "ns-train", "pgsd-weather", *flags)
+    assert done.returncode == 1 and "was begun for something else: --effect is fog, was snowfall" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_camera_path_shows_its_times(run: Path):

@@ -146,10 +146,10 @@ def _dataparser_config(config_path: Path, record: Record, data: Path) -> Any:
     odd = [name for name, value in options.items() if not _plain(value)]
     if odd:
         raise SceneError(f"{config_path}: {', '.join(odd)} of its dataparser must be plain values: pass data= instead")
-    if name == "ColmapDataParserConfig" and options.get("downscale_factor") is None:
-        images = data / options.get("images_path", "images")
-        # Asked for a size by nobody, it wants to make smaller photographs first; their cameras are the same.
-        if not list(images.parent.glob(f"{images.name}_*")):
+    if name == "ColmapDataParserConfig":
+        # Where photographs of the wanted size are missing it asks, and makes them with a shell that is given their names.
+        factor, images = options.get("downscale_factor"), options.get("images_path", "images")
+        if not (isinstance(factor, int) and (data / f"{images}_{factor}").is_dir()):
             options["downscale_factor"] = 1
     return kind(**options, data=data)
 

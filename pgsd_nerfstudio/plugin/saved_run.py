@@ -5,6 +5,7 @@ nerfstudio's own commands make Python objects of whatever config.yml names; this
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -69,5 +70,11 @@ def read_options(config_path: Path) -> tuple[RunOptions, Path | None]:
         raise RunError(
             f"{config_path} is damaged: {where} of its run cannot be used ({first['msg']}); train it again"
         ) from error
-    options.check()
-    return options, made_in if isinstance(made_in, Path) else None
+    try:
+        options.simulation.check()
+    except ValueError as error:
+        raise RunError(f"{config_path} is damaged: {error}") from error
+    # What the words of the weather mean was settled when it was made: a file must not have a language model asked, at an address
+    # that it names and with the user's key.
+    asking_nobody = replace(options.weather, llm=None, llm_url=None)
+    return replace(options, weather=asking_nobody), made_in if isinstance(made_in, Path) else None
