@@ -16,6 +16,8 @@ from pgsd_nerfstudio.plugin.known_errors import explained, show_sentences
 from pgsd_nerfstudio.scene.scene import SceneError
 from pgsd_nerfstudio.version import __version__
 
+GONE = "pgsd_nerfstudio.plugin" + ".gone.RunOptions"
+
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -55,7 +57,7 @@ def rewritten(path: Path, old: str, new: str) -> None:
 
 def test_a_run_of_an_older_version_says_so_even_where_its_classes_have_moved(run: Path):
     rewritten(run / "config.yml", f"version: {__version__}", "version: 0.0.9")
-    rewritten(run / "config.yml", "pgsd_nerfstudio.plugin.options.RunOptions", "pgsd_nerfstudio.plugin.gone.RunOptions")
+    rewritten(run / "config.yml", "pgsd_nerfstudio.plugin.options.RunOptions", GONE)
     sentence = opening(run)
     assert sentence is not None and sentence.startswith("this config was written by pgsd_nerfstudio 0.0.9, installed is")
 
@@ -65,7 +67,7 @@ def test_a_run_of_an_older_version_says_so_even_where_its_classes_have_moved(run
     [
         (
             "pgsd_nerfstudio.plugin.options.RunOptions",
-            "pgsd_nerfstudio.plugin.gone.RunOptions",
+            GONE,
             "cannot make a configuration of it",
         ),
         ("method_name: pgsd-weather", "method_name: [pgsd-weather", "cannot be read as the config.yml of a run"),
