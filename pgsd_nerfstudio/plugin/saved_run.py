@@ -74,7 +74,7 @@ def read_options(config_path: Path) -> tuple[RunOptions, Path | None]:
         options.simulation.check()
     except ValueError as error:
         raise RunError(f"{config_path} is damaged: {error}") from error
-    # What the words of the weather mean was settled when it was made: a file must not have a language model asked, at an address
-    # that it names and with the user's key.
+    # What the words of the weather mean was settled when it was made: a file must not have a language model asked, at an
+    # address that it names and with the user's key.
     asking_nobody = replace(options.weather, llm=None, llm_url=None)
     return replace(options, weather=asking_nobody), made_in if isinstance(made_in, Path) else None
