@@ -7,6 +7,7 @@ import io
 import json
 import struct
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,35 @@ def write_splat(path: Path, cloud: Gaussians) -> Path:
         rows.append(bytes(round(255 * value) for value in (*colour, cloud.opacities[i].item())))
         rows.append(bytes(min(255, round(128 * value) + 128) for value in cloud.quats[i].tolist()))
     path.write_bytes(b"".join(rows))
+    return path
+
+
+def write_ksplat(path: Path, cloud: Gaussians, *, full: int, partial: list[int], size: int = 4) -> Path:
+    """Level 1: `full` buckets of `size` Gaussians, then smaller ones; each bucket's middle is that of its Gaussians."""
+    counts = [size] * full + partial
+    n, block, steps = len(cloud), 8.0, 32767
+    assert sum(counts) == n
+    ends = np.cumsum([0, *counts])
+    degree = round(cloud.colors.shape[1] ** 0.5) - 1
+    middles = [cloud.means[a:b].mean(dim=0).tolist() for a, b in pairwise(ends)]
+    rows = []
+    for i in range(n):
+        middle = middles[int(np.searchsorted(ends, i, side="right")) - 1]
+        rows.append(
+            struct.pack(
+                "<3H",
+                *(round((c - m) / (block / 2) * steps) + steps for c, m in zip(cloud.means[i].tolist(), middle, strict=True)),
+            )
+        )
+        rows.append(struct.pack("<7e", *cloud.scales[i].tolist(), *cloud.quats[i].tolist()))
+        colour = (cloud.colors[i, 0] * C0 + 0.5).clamp(0, 1).tolist()
+        rows.append(bytes(round(255 * value) for value in (*colour, cloud.opacities[i].item())))
+        for band in range(1, degree + 1):
+            rows.append(b"".join(struct.pack("<e", v) for v in cloud.colors[i, band**2 : (band + 1) ** 2].T.flatten().tolist()))
+    header = struct.pack("<4B4IHH5f", 0, 1, 0, 0, 1, 1, n, n, 1, 0, 0, 0, 0, -1.5, 1.5).ljust(4096, b"\0")
+    section = struct.pack("<4IfHHIIIIH", n, n, size, len(counts), block, 12, 0, steps, 0, full, len(partial), degree)
+    buckets = struct.pack(f"<{len(partial)}I", *partial) + b"".join(struct.pack("<3f", *middle) for middle in middles)
+    path.write_bytes(header + section.ljust(1024, b"\0") + buckets + b"".join(rows))
     return path
 
 

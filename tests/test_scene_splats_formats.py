@@ -15,7 +15,18 @@ import pytest
 import roma
 import torch
 from plyfile import PlyData
-from splat_files import DATA, a_cloud, covariances, matched, write_first_sog, write_gltf, write_ply, write_splat, write_spz
+from splat_files import (
+    DATA,
+    a_cloud,
+    covariances,
+    matched,
+    write_first_sog,
+    write_gltf,
+    write_ksplat,
+    write_ply,
+    write_splat,
+    write_spz,
+)
 
 from pgsd_nerfstudio.scene.errors import SceneError
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -78,6 +89,32 @@ def test_what_converters_made_is_what_they_were_given(name):
     assert_alike(read.gaussians, original(), **allowed)
 
 
+def test_a_compressed_ply_has_11_10_and_11_bits():
+    read, truth = matched(read_splat(DATA / "packed.compressed.ply").gaussians, original())
+    extent = truth.means.amax(dim=0) - truth.means.amin(dim=0)
+    steps = torch.tensor([2047, 1023, 2047])
+    assert ((read.means - truth.means).abs().amax(dim=0) <= 0.51 * extent / steps).all()
+
+
+def test_the_ends_of_packed_harmonics_are_4(tmp_path):
+    """Byte 0 is -4 and 255 is 4; between them a byte stands for the middle of its 256th part."""
+    ply = PlyData.read(str(DATA / "packed.compressed.ply"))
+    for value in range(32):
+        ply["sh"].data["f_rest_16"][value] = (255 * value + 15) // 31
+    ply.write(str(tmp_path / "a.ply"))
+    stored = ply["sh"].data["f_rest_16"].astype(float)
+    expected = np.where(stored == 0, -4, np.where(stored == 255, 4, ((stored + 0.5) / 256 - 0.5) * 8))
+    assert read_splat(tmp_path / "a.ply").gaussians.colors[:, 2, 1].numpy() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("full", "partial"), [(6, []), (0, [3, 1, 20]), (4, [3, 2, 3])])
+def test_a_ksplat_of_several_buckets(tmp_path, full, partial):
+    cloud = a_cloud(degree=2)
+    read = read_splat(write_ksplat(tmp_path / "a.ksplat", cloud, full=full, partial=partial)).gaussians
+    truth = Gaussians(cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.colors.clamp(-1.77245, 1.77245))
+    assert_alike(read, truth, centre=7e-5, shape=3e-3, opacity=1.01 * BYTE, dc=0.0071, rest=3e-4)
+
+
 def test_splat_transform_turns_gltf_about_z():
     """It writes glTF, and no other format, in the axes of its engine; what is read is what the file says."""
     exact = dict(centre=1e-6, shape=1e-5, opacity=1e-6, dc=1e-6, rest=1e-6)
@@ -122,8 +159,9 @@ def test_an_spz_with_axes_that_are_swapped(tmp_path):
 
 def test_dot_splat(tmp_path):
     cloud = a_cloud(degree=0)
+    cloud.quats[0] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     read = read_splat(write_splat(tmp_path / "a.splat", cloud)).gaussians
-    assert read.sh_degree == 0
+    assert read.sh_degree == 0 and read.quats[0].tolist() == [1, 0, 0, 0]  # byte 128 is 0
     truth = Gaussians(cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.colors.clamp(-1.77245, 1.77245))
     assert_alike(read, truth, centre=1e-6, shape=0.03, opacity=1.01 * BYTE, dc=0.0071, rest=0)
 
