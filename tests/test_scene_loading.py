@@ -76,7 +76,6 @@ def test_arguments_that_cannot_be_what_they_are(tmp_path):
         (("demo",), {"camera": "orbit"}, "the demo has cameras of its own"),
         ((ply, data), {"camera": "orbit"}, "leave one of the two out"),
         ((ply,), {"camera": "dolly"}, "camera must be 'orbit'"),
-        ((tmp_path,), {}, "is a folder: pass the splat in it, such as .*a.ply, with data="),
         ((data,), {}, "holds no splat: if these are its cameras, pass the splat with data="),
     ]:
         with pytest.raises(SceneError, match=sentence) as refusal:
@@ -84,7 +83,17 @@ def test_arguments_that_cannot_be_what_they_are(tmp_path):
         assert "--" not in str(refusal.value)
     (tmp_path / "capture").mkdir()
     write_transforms(tmp_path / "capture" / "transforms.json")
-    with pytest.raises(SceneError, match=r"holds cameras and no splat: train one \(ns-train splatfacto --data .*with data="):
+    (tmp_path / "capture" / "sparse_pc.ply").touch()
+    (tmp_path / "splats").mkdir()
+    write_ply(tmp_path / "splats" / "b.ply")
+    with pytest.raises(SceneError, match=r"is a folder: pass the splat in it, such as .*b\.ply, with data="):
+        read_scene(tmp_path / "splats")
+    with pytest.raises(
+        SceneError, match=r"holds cameras, .* pass a splat that was trained on them, with data=.*ns-train splatfacto"
+    ):
+        read_scene(tmp_path / "capture")
+    write_ply(tmp_path / "capture" / "b.ply")
+    with pytest.raises(SceneError, match=r"pass a splat that was trained on them, such as .*/capture/b\.ply, with data="):
         read_scene(tmp_path / "capture")
 
 
@@ -111,7 +120,7 @@ def test_up_that_is_given_is_up(tmp_path):
     for up, direction in (("-y", [0, -1, 0]), ((0, 3, 4), [0, 0.6, 0.8])):
         frame = read_scene(tmp_path / "a.ply", data, up=up).frame
         assert (frame.rotation @ torch.tensor(direction, dtype=torch.float32)).tolist() == pytest.approx([0, 0, 1], abs=1e-6)
-        assert "up as given" in frame.source
+        assert "up is taken as" in frame.source
     assert read_scene("demo", up="x").frame.rotation[2].tolist() == pytest.approx([1, 0, 0], abs=1e-6)
 
 

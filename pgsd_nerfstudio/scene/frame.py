@@ -153,7 +153,7 @@ def estimate_frame(
         upward, up_source = _up(cameras)
     else:
         upward = torch.tensor(direction(up), dtype=torch.float64)
-        up_source = f"up as given ({_numbers(upward)})"
+        up_source = f"up is taken as {_numbers(upward)}"
     centers = cameras.centers.double()
     middle, radius = attention(cameras, gaussians)
     camera_height = (centers @ upward).median()

@@ -15,6 +15,8 @@ from pgsd_nerfstudio.scene.frame import direction
 from pgsd_nerfstudio.scene.splats.reading import SPLAT_SUFFIXES
 
 ACCEPTED = f"a splatfacto run folder, its config.yml, a .ckpt, a splat ({', '.join(SPLAT_SUFFIXES)}), Inria's output folder"
+POINTS = ("sparse_pc.ply", "points3D.ply", "input.ply")
+"""Clouds of points that nerfstudio and Inria's trainer lay beside their data, and no splats."""
 
 
 def check_source(
@@ -103,14 +105,16 @@ def source_of(path: Path) -> Source:
         return _of_run(checkpoints[-1], run)
     if (splat := newest_splat(run)) is not None:
         return Source(splat, run.name, cameras=run)
-    splats = [file for file in run.iterdir() if file.suffix.lower() in SPLAT_SUFFIXES] if path.is_dir() else []
-    if splats:
-        raise SceneError(f"{path} is a folder: pass the splat in it, such as {splats[0]}, with data= for its cameras")
-    if path.is_dir() and camera_file(path) is not None:
-        raise SceneError(
-            f"{path} holds cameras and no splat: train one (ns-train splatfacto --data {path}) and pass its run, or pass a "
-            f"splat that was trained on it with data={path}"
-        )
+    if path.is_dir():
+        splats = [file for file in sorted(run.iterdir()) if file.suffix.lower() in SPLAT_SUFFIXES and file.name not in POINTS]
+        such = f", such as {splats[0]}" if splats else ""
+        if camera_file(path) is not None:
+            raise SceneError(
+                f"{path} holds cameras, and is no scene: pass a splat that was trained on them{such}, with data={path}; or "
+                f"train one (ns-train splatfacto --data {path}) and pass its run"
+            )
+        if splats:
+            raise SceneError(f"{path} is a folder: pass the splat in it{such}, with data= for its cameras")
     raise SceneError(f"{run} is no trained run: expected nerfstudio_models/step-*.ckpt in it, found none")
 
 

@@ -10,7 +10,7 @@ import importlib.util
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -72,7 +72,7 @@ class SceneOptions:
         from pgsd_nerfstudio.weather.loading import load_scene
 
         with _flags():
-            return load_scene(
+            scene = load_scene(
                 self.load_scene,
                 self.data,
                 metres_per_unit=self.metres_per_unit,
@@ -81,6 +81,7 @@ class SceneOptions:
                 camera=self.camera,
                 trust_cameras=self.trust_cameras,
             )
+        return replace(scene, remarks=tuple(ARGUMENT.sub(_flag, remark) for remark in scene.remarks))
 
 
 @dataclass(frozen=True, kw_only=True)
