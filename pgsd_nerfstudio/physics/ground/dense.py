@@ -21,6 +21,7 @@ from pgsd_nerfstudio.physics.bodies import Bodies, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
+MOST_CELLS = 12_000_000  # of the grid: 3 GB while it is made; larger domains get larger cells
 FRAMES = 3  # frames for which matter must be slow before it is at rest
 
 
@@ -42,6 +43,8 @@ class DenseMatter:
 
     def __init__(self, dense: Dense, response: SurfaceResponse, surface: SurfaceMesh, domain: Domain) -> None:
         self.dense, self.response, self.surface, self.domain = dense, response, surface, domain
+        self.cell = max(dense.cell, (domain.volume / MOST_CELLS) ** (1 / 3))
+        """Spacing of the grid, m."""
         self._mpm = None
         self._ids = np.zeros(0, np.int64)
         """Index in the solver of each of the run's dense particles, in their order."""
@@ -57,11 +60,11 @@ class DenseMatter:
         """
         if len(sliding) == 0:
             return np.zeros(0, bool)
-        cells = np.floor(np.concatenate([sliding.positions, dense.positions]) / self.dense.cell).astype(np.int64)
+        cells = np.floor(np.concatenate([sliding.positions, dense.positions]) / self.cell).astype(np.int64)
         _, cell = np.unique(cells, axis=0, return_inverse=True)
         cell = cell.reshape(-1)
         total = np.bincount(cell, np.concatenate([volumes, filled]))
-        return total[cell[: len(sliding)]] >= self.dense.solid_fraction * self.dense.cell**3
+        return total[cell[: len(sliding)]] >= self.dense.solid_fraction * self.cell**3
 
     def add(self, bodies: Bodies, volumes: Float[ndarray, " n"]) -> None:
         """Add particles after the present ones.
@@ -111,7 +114,7 @@ class DenseMatter:
             from pgsd_nerfstudio.physics.mpm import Mpm, MpmConfig, Obstacle, Sleep
             from pgsd_nerfstudio.surface.distance import DistanceGrid
 
-            cell = self.dense.cell
+            cell = self.cell
             obstacle = None
             if len(self.surface.triangles):
                 lower = np.asarray(self.domain.lower) - cell
