@@ -22,8 +22,12 @@ from hypothesis import strategies as st
 from splat_files import DATA, a_cloud, write_gltf, write_splat
 
 from pgsd_nerfstudio.effects.request import Request
+from pgsd_nerfstudio.plugin.checkpoints import read_checkpoint
+from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.scene.captures.reading import read_capture
 from pgsd_nerfstudio.scene.errors import SceneError
+from pgsd_nerfstudio.scene.path_file import read_camera_path
+from pgsd_nerfstudio.scene.path_times import path_times
 from pgsd_nerfstudio.scene.run_config import read_run_config
 from pgsd_nerfstudio.scene.splats.reading import read_splat
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
@@ -105,6 +109,15 @@ machine:
 """
 
 
+def a_camera_path() -> dict[str, Any]:
+    frames = [
+        {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50.0, "aspect": 1.5, "render_time": i / 2} for i in range(3)
+    ]
+    keyframes = [{"matrix": np.eye(4).ravel().tolist(), "fov": 50.0, "aspect": 1.5, "render_time": float(i)} for i in range(2)]
+    whole = {"render_width": 48, "render_height": 32, "seconds": 1.0, "fps": 3.0, "camera_type": "perspective"}
+    return {**whole, "is_cycle": False, "default_transition_sec": 1.0, "keyframes": keyframes, "camera_path": frames}
+
+
 def written(path: Path, content: bytes | str) -> Path:
     path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
     return path
@@ -135,6 +148,20 @@ def tensors_at(path: Path, whole: Any, content: bytes) -> None:
     assert found[1] == whole[1] and all(torch.equal(found[0][name], tensor) for name, tensor in whole[0].items())
 
 
+def path_at(path: Path, content: str) -> None:
+    found = read_camera_path(written(path, content))
+    assert torch.isfinite(found.cameras.viewmats).all() and torch.isfinite(found.cameras.Ks).all()
+    moments = path_times(found.times, seconds=10.0, frames=250).times
+    assert len(moments) == len(found.cameras) and all(0 <= moment <= 1 for moment in moments)
+
+
+def training_checkpoint_at(path: Path, whole: dict[str, Any], content: bytes) -> None:
+    """What is read is what was stored: nothing that has changed is taken."""
+    found = read_checkpoint(written(path, content))
+    assert found["step"] == whole["step"]
+    assert torch.equal(found["pipeline"]["_model.look.active"], whole["pipeline"]["_model.look.active"])
+
+
 def cases(folder: Path) -> dict[str, Callable[[], Case]]:
     """What is mutated, how it is used, and what a refusal is; made when asked for."""
 
@@ -146,6 +173,12 @@ def cases(folder: Path) -> dict[str, Callable[[], Case]]:
         save_tensors(folder / "whole.safetensors", *whole)
         content = (folder / "whole.safetensors").read_bytes()
         return changed_bytes(content), partial(tensors_at, folder / "stored.safetensors", whole), SceneError
+
+    def training_checkpoint() -> Case:
+        whole = {"step": 7, "pipeline": {"_model.look.active": torch.randn(300)}, "optimizers": {"look": {"lr": 0.1}}}
+        torch.save(whole, folder / "step.ckpt")
+        content = (folder / "step.ckpt").read_bytes()
+        return changed_bytes(content), partial(training_checkpoint_at, folder / "step.ckpt", whole), RunError
 
     def ply() -> Case:
         binary, text = a_ply(), a_text_ply()
@@ -195,6 +228,8 @@ def cases(folder: Path) -> dict[str, Callable[[], Case]]:
             partial(config_at, folder / "config.yml"),
             SceneError,
         ),
+        "camera path": lambda: (changed_json(a_camera_path()), partial(path_at, folder / "path.json"), SceneError),
+        "training checkpoint": training_checkpoint,
         "stored tensors": stored,
         "answer of a language model": lambda: (
             changed_json(json.loads(Request(base="snowfall", rgb=(0.5, 0.0, 0.5), prompt="Purple snow in {scene}").to_json())),
