@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pgsd_nerfstudio import load_scene
 from pgsd_nerfstudio.cli.main import run
+from pgsd_nerfstudio.scene.camera_path import choose_views
 
 
 def preview(yard, output, **flags) -> int:
@@ -93,6 +95,21 @@ def test_a_video_is_no_longer_than_its_weather(yard, tmp_path, capsys):
     assert preview(yard, tmp_path / "v.mp4", frames=50, seconds=0.2, **{"max-particles": 50}) == 0
     assert "the weather has 5 frames: the video shows all of them, not 50" in capsys.readouterr().err
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "v.mp4"))[0] == 5
+
+
+def test_a_camera_that_keeps_away_from_all_particles_says_so(yard, tmp_path, capsys):
+    """At 100 m per unit the views stand hundreds of metres apart, and the air lies around the last that a preview shows."""
+    ply, data = yard
+    scene = load_scene(ply, data, metres_per_unit=100.0)
+    last = choose_views(scene.cameras, scene.frame)[1]
+    opposite = (last + 4) % 8
+    for views, away in ((None, False), ((last, last), False), ((opposite, opposite), True)):
+        flags = {"metres-per-unit": 100, "max-particles": 50, "fps": 5, "seconds": 20.0} | (
+            {} if views is None else {"views": views}
+        )
+        assert preview(yard, tmp_path / "v.mp4", frames=2, **flags) == 0
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("keeps away from the air in which particles are simulated" in said) == away
 
 
 def test_a_splat_that_is_none_is_named(yard, tmp_path, capsys):

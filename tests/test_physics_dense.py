@@ -1,4 +1,4 @@
-"""Dense matter in large domains: the cells of its grid grow, so that memory is bounded, and matter comes to rest in them too."""
+"""Dense matter in large domains: the cells of its grid grow, so that memory is bounded, and matter rests in them too."""
 
 from __future__ import annotations
 

@@ -37,6 +37,8 @@ def test_strays_and_abysses_do_not_deepen_it():
     assert down_to_ground(DOMAIN, ground((-5, 5, 5, 0.0), (0.0, 0.04, 0.02, -3.0))) == DOMAIN
     assert down_to_ground(DOMAIN, ground((-5, 1, 5, 0.0), (1, 5, 5, -2 * DEEPEST))) == DOMAIN
     assert down_to_ground(DOMAIN, SurfaceMesh.empty()) == DOMAIN
+    high = Domain((-2.0, -2.0, 5.0), (2.0, 2.0, 30.0))  # around a drone
+    assert down_to_ground(high, ground((-5, 5, 5, 0.0))) == high
     ceiling = ground((-5, 5, 5, -1.0))
     assert down_to_ground(DOMAIN, replace(ceiling, triangles=ceiling.triangles[:, [0, 2, 1]])) == DOMAIN  # it faces down
 

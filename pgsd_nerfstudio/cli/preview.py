@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from pgsd_nerfstudio.scene.cameras import Cameras
+    from pgsd_nerfstudio.weather.weather import Weather
 
 LONGEST = 640  # pixels of the longer side, where nothing is asked for
 
@@ -58,6 +59,11 @@ class Preview(WeatherCommand):
         with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
             weather = make_weather(prepare_scene(scene), effect, self.simulation, edited_images=self.answer.edited_images)
         cameras = path.resized(*self._size(path))
+        if not _meets_particles(weather, cameras):
+            say(
+                "the camera keeps away from the air in which particles are simulated, at most 20 x 20 m: it shows what they "
+                "cover and none of them falling; choose other --views, or see whether --metres-per-unit is right"
+            )
 
         def picture(index: int) -> Tensor:
             return weather.render_frame(cameras[index], self._first + index).rgb
@@ -120,3 +126,12 @@ class Preview(WeatherCommand):
         if self.start is not None:
             return round(self.start * self.simulation.fps)
         return self.simulation.frames - self._shown
+
+
+def _meets_particles(weather: Weather, cameras: Cameras) -> bool:
+    """Whether a camera comes so near to the simulated air that particles are seen."""
+    from pgsd_nerfstudio.physics.clock import SIGHT, Domain
+
+    bounds = weather.history.about["domain"]
+    centers = weather.scene.frame.to_metric(cameras.centers).double().numpy(force=True)
+    return bool((Domain(tuple(bounds[:3]), tuple(bounds[3:])).distances(centers) < SIGHT).any())

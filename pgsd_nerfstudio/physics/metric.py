@@ -27,7 +27,7 @@ from pgsd_nerfstudio.physics.air.emitters import Sizes
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import RunState
-from pgsd_nerfstudio.physics.clock import Clock, Domain
+from pgsd_nerfstudio.physics.clock import SIGHT, Clock, Domain
 from pgsd_nerfstudio.physics.frames import simulate_chunk
 from pgsd_nerfstudio.physics.ground.deposits import Deposits
 from pgsd_nerfstudio.physics.ground.landing import Ground
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 MAX_PARTICLES = 20_000  # flying at once; a CPU renders and refines that many in reasonable time
 CHUNK = 25  # frames; an interruption loses at most that many
-SIGHT = 20.0  # m; a particle farther from every camera than this is not seen
 LEAST_GUSTS = 0.35  # smallest gustiness that the region of sight allows for
 SIGHT_MARGIN = 0.5  # m around views; the cameras of training clips stray no farther from the straight paths between cameras
 

@@ -17,13 +17,15 @@ DEEPEST = 20.0  # m below the bottom of the domain; ground farther down is too f
 
 
 def down_to_ground(domain: Domain, surface: SurfaceMesh) -> Domain:
-    """The domain, deepened where more than a two-hundredth of its plan has ground less than 20 cm above its bottom or below it.
+    """The domain, deepened where more than a two-hundredth of its plan has ground below its bottom or less than 20 cm above it.
+
+    A domain whose bottom is above the ground at z = 0 stays as it is.
 
     Args:
         domain: the air around the cameras, in metres.
         surface: the mesh that particles land on, in metres.
     """
-    if len(surface.triangles) == 0:
+    if len(surface.triangles) == 0 or domain.lower[2] > 0:
         return domain
     lower, size, bottom = np.array(domain.lower[:2]), np.array(domain.size[:2]), domain.lower[2]
     at = lower + size * (np.stack(np.meshgrid(*[np.arange(RAYS)] * 2, indexing="ij"), -1).reshape(-1, 2) + 0.5) / RAYS
