@@ -418,6 +418,19 @@ def test_an_interrupted_training_keeps_what_it_has_learned(
     opened(config)
 
 
+def test_ctrl_c_before_training_leaves_nothing_and_ends_with_130(
+    prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pgsd_nerfstudio.plugin.pipeline.prepare_weather", interrupted)
+    with pytest.raises(SystemExit, match="130"):
+        train(tiny_config(write_scene(tmp_path), prior, tmp_path / "outputs"))
+    assert "Interrupted before training began" in capsys.readouterr().out
+    assert not (tmp_path / "outputs").exists()
+
+
 def test_a_full_disk_is_said_in_a_sentence(prior: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from pgsd_nerfstudio.physics.record.history import ParticleHistory
 
