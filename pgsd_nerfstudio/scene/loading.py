@@ -149,7 +149,7 @@ def _doubts(cameras: Cameras, frame: Frame, metres_per_unit: float | None) -> li
     where = f"at {metres_per_unit:g} m per unit the cameras stand {stand} m above the ground"
     usual = metres_per_unit * CAMERA_HEIGHT / height
     if LOWEST <= height <= HIGHEST or usual <= 0:
-        hint = f": at {usual:.3g} m per unit they would stand {CAMERA_HEIGHT:g} m above it" if usual > 0 else ""
+        hint = f" (at {usual:.3g} m per unit they would stand {CAMERA_HEIGHT:g} m above it)" if usual > 0 else ""
         return [f"{where}: is the scale right{hint}?"]
     raise SceneError(
         f"{where}, where no camera can be: leave metres_per_unit= out to have the scale estimated, or pass {usual:.3g}, with "
