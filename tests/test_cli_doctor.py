@@ -102,6 +102,16 @@ def test_little_memory_and_a_full_disk_are_said(machine, monkeypatch: pytest.Mon
         assert machine()["disk of the cache"].state == machine()["disk here"].state == state
 
 
+def test_a_container_without_proc_is_examined_too(machine, monkeypatch: pytest.MonkeyPatch):
+    import psutil
+
+    def absent() -> None:
+        raise FileNotFoundError("/proc/meminfo")
+
+    monkeypatch.setattr(psutil, "virtual_memory", absent)
+    assert "cannot be told" in machine()["memory"].found
+
+
 def test_a_cache_that_cannot_be_written_is_missing(machine, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     found = machine()

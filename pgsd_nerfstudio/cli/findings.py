@@ -265,10 +265,14 @@ def _room() -> Iterator[Finding]:
     """Free memory and disk."""
     import psutil
 
-    memory = psutil.virtual_memory()
-    state = "missing" if memory.available < MEMORY else "slow" if memory.available < LITTLE_MEMORY else "ok"
-    todo = "" if state == "ok" else "end other programs, or take smaller scenes and fewer particles (--max-particles)"
-    yield Finding("memory", state, f"{size_of(memory.available)} of {size_of(memory.total)} free", todo)
+    try:
+        memory = psutil.virtual_memory()
+    except OSError as error:  # a container without /proc
+        yield Finding("memory", "slow", f"cannot be told: {error}", "mount /proc")
+    else:
+        state = "missing" if memory.available < MEMORY else "slow" if memory.available < LITTLE_MEMORY else "ok"
+        todo = "" if state == "ok" else "end other programs, or take smaller scenes and fewer particles (--max-particles)"
+        yield Finding("memory", state, f"{size_of(memory.available)} of {size_of(memory.total)} free", todo)
     for name, folder, way in (
         ("disk of the cache", cache_dir(), "free some, pgsd cache clear, or set PGSD_CACHE to another disk"),
         ("disk here", Path.cwd(), "free some, or write to another disk (--output, --output-dir)"),
