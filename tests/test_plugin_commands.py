@@ -120,7 +120,7 @@ def test_bad_input_is_a_sentence_and_no_traceback(run: Path):
     (run / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     failed = command(run, "ns-train", "pgsd-weather", "--load-scene", "cloud.ply", "--data", run, *SHORT)
     assert failed.returncode == 1 and "Traceback" not in failed.stderr
-    assert "pgsd-weather: " in failed.stderr and "is no 3D Gaussian splat" in failed.stderr
+    assert "pgsd-weather: " in failed.stderr and "cloud.ply is a point cloud: it lacks the fields" in failed.stderr
     motion = run / Path(CONFIG).with_name("motion_prior.safetensors")
     motion.rename(motion.with_suffix(".away"))
     failed = command(run, "ns-render", "interpolate", "--load-config", CONFIG)
@@ -131,4 +131,4 @@ def test_bad_input_is_a_sentence_and_no_traceback(run: Path):
 
 def test_the_checkpoint_is_small(run: Path):
     stored = torch.load(next((run / CONFIG).parent.glob("nerfstudio_models/*.ckpt")), weights_only=False)
-    assert sum(value.numel() for value in stored["pipeline"].values()) < 100_000
+    assert sum(value.numel() for value in stored["pipeline"].values() if torch.is_tensor(value)) < 100_000
