@@ -79,7 +79,7 @@ def test_twice_the_amount_is_twice_the_water_or_the_extinction(name):
 def test_an_amount_is_of_the_intensity_that_is_given():
     assert turned(intensity=2.0, amount=3.0).emission.intensity == 6.0
     assert turned("fog", intensity=200.0, amount=4.0).emission.intensity == 50.0
-    assert "would be 150 mm/h of water, but snowfall takes 0-100: 100 is used" in said(intensity=50.0, amount=3.0)
+    assert "would be 150 mm/h of water, but snowfall takes 0.01-100: 100 is used" in said(intensity=50.0, amount=3.0)
 
 
 def test_particles_are_wider_by_the_size():
