@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.rows import scene_size
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.demo import demo_depth, demo_scene
@@ -54,6 +55,7 @@ def bench(quick: bool) -> list[Record]:
         Record("surface from 40 views", seconds, "s", error=error, error_unit="cm", source=size),
         Record("rays that fall on the surface", 1e6 * rays / count, "us each", source=size),
         Record("closest points 5 cm above it", 1e6 * nearest / count, "us each", source=size),
+        *scene_size.rows(exact, quick=quick),
     ]
 
 
