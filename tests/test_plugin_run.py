@@ -321,7 +321,7 @@ def test_where_there_is_no_checkpoint_is_said_before_anything_is_done(trained: P
     (tmp_path / "cut.ckpt").write_bytes(next(trained.parent.glob("nerfstudio_models/*.ckpt")).read_bytes()[:5000])
     for flags, sentence in (
         ({"load_dir": tmp_path / "nothing"}, r"found no folder at"),
-        ({"load_dir": trained.parent}, r"no checkpoint step-\*\.ckpt in .*use --load-dir .*nerfstudio_models"),
+        ({"load_dir": trained.parent}, r"no checkpoint step-\*\.ckpt in .*: use .*nerfstudio_models"),
         ({"load_dir": trained.parent / "nerfstudio_models", "load_step": 7}, r"no checkpoint step-000000007\.ckpt"),
         ({"load_checkpoint": tmp_path / "no.ckpt"}, r"there is no checkpoint at"),
         ({"load_checkpoint": tmp_path / "cut.ckpt"}, r"cut\.ckpt is damaged"),
