@@ -188,7 +188,7 @@ def test_pictures_are_png_in_the_folder_that_is_meant(scene, weather, tmp_path: 
         ({"max_particles": 10**11}, "--max-particles must be at most 1e+07, got 1e+11"),
         ({"seconds": 3000, "fps": 1000}, "are 3,000,000 frames; at most 200,000 can be simulated"),
         ({"seed": -1}, "--seed must not be negative"),
-        ({"seed": 2**70}, "less than 2.63, got"),
+        ({"seed": 2**70}, "less than 2^63, got"),
         ({"physics": "newton"}, "--physics must be metric or paper, got 'newton'"),
         ({"collisions": "False"}, "--collisions must be True or False, got 'False'"),
         ({"max_particles": 1.5}, "--max-particles must be a whole number, got 1.5"),
