@@ -1,9 +1,12 @@
-"""What a command says when it cannot do what was asked: one sentence on stderr, exit code 1."""
+"""How a command ends that cannot do what was asked: one sentence on stderr, exit code 1; or that Ctrl-C ends."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+INTERRUPTED = 130
+"""The exit code of a process that Ctrl-C ended: 128 and the number of the signal, as shells have it."""
 
 
 class Refusal(Exception):

@@ -19,7 +19,7 @@ from pgsd_nerfstudio.cli.preview import Preview
 from pgsd_nerfstudio.cli.render import Render
 from pgsd_nerfstudio.cli.simulate import Simulate
 from pgsd_nerfstudio.cli.verify import Verify
-from pgsd_nerfstudio.refusal import Refusal
+from pgsd_nerfstudio.refusal import INTERRUPTED, Refusal
 from pgsd_nerfstudio.version import __version__
 
 Command = (
@@ -32,8 +32,6 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
 )
-INTERRUPTED = 130
-"""The exit code of a process that Ctrl-C ended, 128 and the number of the signal."""
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from pgsd_nerfstudio.cli.asked import WeatherCommand
 from pgsd_nerfstudio.cli.console import console, say
 from pgsd_nerfstudio.cli.picture_size import check_size, even_size
+from pgsd_nerfstudio.cli.video_file import check_name, make_folder, writing
 from pgsd_nerfstudio.refusal import Refusal, refusing
 from pgsd_nerfstudio.weather.options import FLAT, AnswerOptions
 
@@ -55,7 +56,7 @@ class Preview(WeatherCommand):
         scene = self.open_scene()
         with refusing(ValueError):
             path = slow_path(scene, frames=self._shown, fps=self.simulation.fps, start=self._first, views=self.views)
-        self._make_folder()
+        make_folder(self.output)
         with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
             weather = make_weather(prepare_scene(scene), effect, self.simulation, edited_images=self.answer.edited_images)
         cameras = path.resized(*self._size(path))
@@ -70,13 +71,9 @@ class Preview(WeatherCommand):
 
         shown = track(range(self._shown), "rendering", console=console(), transient=True)
         poster = self.output.with_suffix(".png")
-        try:
+        with writing(self.output):
             write_video(self.output, (picture(index) for index in shown), self.simulation.fps)
             write_picture(poster, picture(self._shown - 1))
-        except OSError as error:
-            raise Refusal(
-                f"{self.output} could not be written ({error}): free some space or choose another --output"
-            ) from error
         say(f"{self._shown} frames in {time.perf_counter() - began:.0f} s")
         print(self.output, poster, sep="\n")
         return 0
@@ -85,8 +82,7 @@ class Preview(WeatherCommand):
         if not self.frames > 0:
             raise Refusal(f"--frames must be positive, got {self.frames:g}")
         check_size(self.width, self.height)
-        if self.output.suffix.lower() != ".mp4":
-            raise Refusal(f"--output must end in .mp4, got {self.output}")
+        check_name(self.output)
         if self.start is not None and not self.start >= 0:
             raise Refusal(f"--start must not be negative, got {self.start:g} s")
         with refusing(ValueError):
@@ -107,13 +103,6 @@ class Preview(WeatherCommand):
         if width is None and height is None:
             width, height = (LONGEST, None) if cameras.width >= cameras.height else (None, LONGEST)
         return even_size(cameras, width, height)
-
-    def _make_folder(self) -> None:
-        """The folder of the output, before anything costly is done."""
-        try:
-            self.output.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Refusal(f"{self.output} cannot be written ({error.strerror}); choose another --output") from error
 
     @property
     def _shown(self) -> int:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from pgsd_nerfstudio.cli.console import console, say
 from pgsd_nerfstudio.cli.picture_size import check_size, even_size
-from pgsd_nerfstudio.refusal import Refusal, refusing
+from pgsd_nerfstudio.cli.video_file import check_name, make_folder, writing
+from pgsd_nerfstudio.refusal import refusing
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,7 +44,9 @@ class Render:
         from pgsd_nerfstudio.plugin.saved_run import open_run
         from pgsd_nerfstudio.weather.video import write_video
 
-        self._check()
+        check_name(self.output)
+        check_size(self.width, self.height)
+        make_folder(self.output)
         began = time.perf_counter()
         say(f"opening {self.load_config}")
         with refusing(ValueError):
@@ -55,12 +58,8 @@ class Render:
         def picture(index: int) -> Tensor:
             return weather.render_frame(cameras[index], frames[index]).rgb
 
-        try:
+        with writing(self.output):
             write_video(self.output, map(picture, shown), fps)
-        except OSError as error:
-            raise Refusal(
-                f"{self.output} could not be written ({error}): free some space or choose another --output"
-            ) from error
         say(f"{len(frames)} frames at {fps:g} per second, rendered in {time.perf_counter() - began:.0f} s")
         print(self.output)
         return 0
@@ -80,12 +79,3 @@ class Render:
             say(found.remark)
         frames = [round(moment * (count - 1)) for moment in found.times]
         return path.cameras, frames, len(frames) / path.seconds
-
-    def _check(self) -> None:
-        if self.output.suffix.lower() != ".mp4":
-            raise Refusal(f"--output must end in .mp4, got {self.output}")
-        check_size(self.width, self.height)
-        try:
-            self.output.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Refusal(f"{self.output} cannot be written ({error.strerror}); choose another --output") from error

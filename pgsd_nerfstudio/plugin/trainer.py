@@ -15,8 +15,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
+from pgsd_nerfstudio.refusal import INTERRUPTED
 
-INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it
 NAMES = {"simulation": "simulation", "rollout": "roll-out"}
 
 
