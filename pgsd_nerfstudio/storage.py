@@ -133,6 +133,23 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     return None
 
 
+def header_of(path: Path) -> tuple[dict[str, Any], int]:
+    """The header of a file of tensors, and the place in the file at which its values begin, in bytes.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is too short for its header, or its header is no JSON object.
+    """
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if length > path.stat().st_size:
+            raise ValueError(f"{path} is shorter than its header")
+        header = json.loads(file.read(length))
+    if not isinstance(header, dict):
+        raise ValueError(f"the header of {path} is no object")
+    return header, 8 + length
+
+
 def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
     """SHA-256 of names, types, shapes and values of the tensors, and of their description."""
     digest = hashlib.sha256(described.encode())

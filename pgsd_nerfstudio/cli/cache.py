@@ -72,12 +72,12 @@ class Kept:
 
 def described(path: Path) -> dict[str, Any]:
     """What a stored file says of itself, read without its tensors; empty if it says nothing or cannot be read."""
+    from pgsd_nerfstudio.storage import header_of  # which loads torch
+
     if path.suffix != ".safetensors":
         return {}
     try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            header = json.loads(file.read(min(length, 1 << 24)))
+        header, _ = header_of(path)
         about = json.loads(header["__metadata__"]["about"])
         return about if isinstance(about, dict) else {}
     except (OSError, ValueError, KeyError, TypeError):

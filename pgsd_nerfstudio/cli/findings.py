@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pgsd_nerfstudio.cli.cache import kept, size_of
-from pgsd_nerfstudio.storage import cache_dir
+from pgsd_nerfstudio.storage import cache_dir, header_of
 from pgsd_nerfstudio.version import __version__
 
 PATIENCE = 60.0
@@ -238,19 +238,16 @@ def _prior() -> Iterator[Finding]:
 def whole(path: Path) -> bool:
     """Whether a safetensors file has the length that its own header tells."""
     try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            size = path.stat().st_size
-            header = json.loads(file.read(length)) if length <= size else {}
+        header, start = header_of(path)
         ends = [entry["data_offsets"][1] for name, entry in header.items() if name != "__metadata__"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
-    return bool(ends) and size == 8 + length + max(ends)
+    return bool(ends) and path.stat().st_size == start + max(ends)
 
 
 def _cache() -> Iterator[Finding]:
     folder = cache_dir()
-    above = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    above = _existing(folder)
     if not (above.is_dir() and os.access(above, os.W_OK)):
         yield Finding("cache", "missing", f"{folder} cannot be written", "set PGSD_CACHE to a folder that you may write")
         return
@@ -259,6 +256,11 @@ def _cache() -> Iterator[Finding]:
     large = size > 20e9
     todo = "pgsd cache list shows it, pgsd cache clear --older-than 30 removes what is old" if large else ""
     yield Finding("cache", "slow" if large else "ok", f"{size_of(size)} in {len(files)} files, {folder}", todo)
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the first one above it that is there."""
+    return next(each for each in (folder, *folder.absolute().parents) if each.exists())
 
 
 def _room() -> Iterator[Finding]:
@@ -277,7 +279,6 @@ def _room() -> Iterator[Finding]:
         ("disk of the cache", cache_dir(), "free some, pgsd cache clear, or set PGSD_CACHE to another disk"),
         ("disk here", Path.cwd(), "free some, or write to another disk (--output, --output-dir)"),
     ):
-        above = next(each for each in (folder, *folder.absolute().parents) if each.exists())
-        free = shutil.disk_usage(above).free
+        free = shutil.disk_usage(_existing(folder)).free
         state = "missing" if free < DISK else "slow" if free < LITTLE_DISK else "ok"
         yield Finding(name, state, f"{size_of(free)} free, {folder}", "" if state == "ok" else way)

@@ -6,6 +6,7 @@ opacity logit of +inf or -inf is an opacity of 1 or 0, a log scale of -inf a fla
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pgsd_nerfstudio.scene.errors import SceneError
-from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 # Beyond these a value is damage, and its cube soon no float32 any more.
@@ -55,6 +56,20 @@ def checked(path: Path, gaussians: Gaussians) -> tuple[Gaussians, Float64[Tensor
 def harmonics(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     """The constant spherical harmonic that shows as `rgb` (0..1) from everywhere."""
     return ((rgb - 0.5) / SH_C0)[:, None]
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """The parts of a splat as one set, with harmonics of the highest degree among them.
+
+    Args:
+        parts: at least one, colours as spherical harmonics.
+
+    Raises:
+        ValueError: some of them are antialiased and others are not.
+    """
+    most = max(part.colors.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.colors, (0, 0, 0, most - part.colors.shape[1])) for part in parts]
+    return concatenate([replace(part, colors=colors) for part, colors in zip(parts, padded, strict=True)])
 
 
 def smoothed(

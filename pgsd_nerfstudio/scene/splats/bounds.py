@@ -1,4 +1,4 @@
-"""How much a packed file may unpack to, so that a few bytes cannot ask for all memory."""
+"""The bytes of a file, and how much a packed one may unpack to, so that a few bytes cannot ask for all memory."""
 
 from __future__ import annotations
 
@@ -12,6 +12,18 @@ from pgsd_nerfstudio.scene.errors import SceneError
 FREE = 1 << 24  # bytes that any file may unpack to
 RATIO = 100  # times its own size; splats shrink to a quarter
 WINDOW = 1 << 27  # bytes that a frame of zstd may look back
+
+
+def contents(path: Path) -> bytes:
+    """All bytes of a file.
+
+    Raises:
+        SceneError: it cannot be opened.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
 
 
 def largest(packed: int) -> int:

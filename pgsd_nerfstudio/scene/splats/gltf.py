@@ -12,7 +12,6 @@ import binascii
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
@@ -23,8 +22,10 @@ import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.scene.errors import SceneError
-from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
+from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.similarity import moved
+from pgsd_nerfstudio.scene.splats.activation import joined
+from pgsd_nerfstudio.scene.splats.bounds import contents
 from pgsd_nerfstudio.scene.splats.spz import unpacked
 
 SPLATS = "KHR_gaussian_splatting"
@@ -51,10 +52,7 @@ def read_glb(path: Path) -> Gaussians:
     Raises:
         SceneError: the file is damaged, holds no Gaussians, or holds them packed or coloured in ways that are not read.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
+    data = contents(path)
     chunks, at = {}, 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<I4s", data, at)
@@ -73,10 +71,7 @@ def read_gltf(path: Path) -> Gaussians:
     Raises:
         SceneError: as for `read_glb`.
     """
-    try:
-        return _read(path, path.read_bytes(), None)
-    except OSError as error:
-        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
+    return _read(path, contents(path), None)
 
 
 def _read(path: Path, text: bytes, binary: bytes | None) -> Gaussians:
@@ -89,8 +84,7 @@ def _read(path: Path, text: bytes, binary: bytes | None) -> Gaussians:
         ]
         if not parts:
             raise _Fault(f"no primitive of it has {SPLATS}: it is a mesh; train a splat on its photographs")
-        degree = max(part.colors.shape[1] for part in parts)
-        return concatenate([_padded(part, degree) for part in parts])
+        return joined(parts)
     except RecursionError as error:
         raise SceneError(f"{path} cannot be read as glTF (its JSON is nested too deeply): download it again") from error
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, struct.error) as error:
@@ -104,11 +98,6 @@ def _read(path: Path, text: bytes, binary: bytes | None) -> Gaussians:
 def _splats(primitive: dict) -> bool:
     extensions = primitive.get("extensions", {})
     return SPLATS in extensions or any(name in extensions for name in PACKED)
-
-
-def _padded(gaussians: Gaussians, coefficients: int) -> Gaussians:
-    missing = coefficients - gaussians.colors.shape[1]
-    return replace(gaussians, colors=torch.nn.functional.pad(gaussians.colors, (0, 0, 0, missing)))
 
 
 class _File:

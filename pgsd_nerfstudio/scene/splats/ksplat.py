@@ -8,15 +8,16 @@ halves, and centres as 16 bits within a bucket; level 2 besides harmonics as byt
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from pgsd_nerfstudio.scene.errors import SceneError
-from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
-from pgsd_nerfstudio.scene.splats.activation import harmonics
+from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.splats.activation import harmonics, joined
+from pgsd_nerfstudio.scene.splats.bounds import contents
 
 HEADER, SECTION = 4096, 1024  # bytes
 REST = (0, 3, 8, 15)  # coefficients beyond the constant, by degree
@@ -53,10 +54,7 @@ def read_ksplat(path: Path) -> Gaussians:
     Raises:
         SceneError: the file is damaged or cut off, or of a version or level that is not known.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
+    data = contents(path)
     if len(data) < HEADER:
         raise SceneError(f"{path} is no .ksplat or cut off: its header needs {HEADER} bytes, it has {len(data):,}")
     major, minor = data[0], data[1]
@@ -73,14 +71,12 @@ def read_ksplat(path: Path) -> Gaussians:
         section = _section(path, data, HEADER + number * SECTION, at, level)
         parts.append(_gaussians(path, data, section, level, low, high))
         at = section.end
-    degree = max((part.colors.shape[1] for part in parts), default=1)
     held = sum(len(part) for part in parts)
     if held != count:
         raise SceneError(f"{path} is damaged: its header has {count:,} Gaussians, its sections {held:,}")
     if not parts:
         return Gaussians.empty()
-    colors = [torch.nn.functional.pad(part.colors, (0, 0, 0, degree - part.colors.shape[1])) for part in parts]
-    return concatenate([replace(part, colors=padded) for part, padded in zip(parts, colors, strict=True)])
+    return joined(parts)
 
 
 def _row(level: int, degree: int) -> np.dtype:

@@ -14,6 +14,7 @@ import torch
 from pgsd_nerfstudio.scene.errors import SceneError
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.splats.activation import harmonics
+from pgsd_nerfstudio.scene.splats.bounds import contents
 
 ROW = np.dtype([("centre", "<f4", 3), ("scales", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 
@@ -24,10 +25,7 @@ def read_dot_splat(path: Path) -> Gaussians:
     Raises:
         SceneError: the file cannot be opened, or holds no whole number of Gaussians.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
+    data = contents(path)
     if len(data) % ROW.itemsize:
         raise SceneError(f"{path} is no .splat or cut off: {len(data):,} bytes are no multiple of {ROW.itemsize}")
     table = np.frombuffer(data, ROW)

@@ -18,7 +18,7 @@ import torch
 from pgsd_nerfstudio.scene.errors import SceneError
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.similarity import moved
-from pgsd_nerfstudio.scene.splats.bounds import check_size, gunzipped, unzstd
+from pgsd_nerfstudio.scene.splats.bounds import check_size, contents, gunzipped, unzstd
 from pgsd_nerfstudio.scene.splats.quaternions import with_largest
 
 MAGIC = b"NGSP"
@@ -55,10 +55,7 @@ def read_spz(path: Path) -> Gaussians:
     Raises:
         SceneError: the file is damaged, or of a version or degree that is not known.
     """
-    try:
-        return unpacked(path, path.read_bytes())
-    except OSError as error:
-        raise SceneError(f"{path} cannot be opened ({error.strerror})") from error
+    return unpacked(path, contents(path))
 
 
 def unpacked(path: Path, data: bytes, axes: str | None = None) -> Gaussians:
