@@ -8,7 +8,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pgsd_nerfstudio.scene.cameras import Cameras, interpolate
+from pgsd_nerfstudio.scene.cameras import Cameras, interpolate, level_axes
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.scene import Scene
 
@@ -164,10 +164,7 @@ def _looked_at(centers: Tensor, forward: Tensor) -> Tensor:
 
 def _from_metric(scene: Scene, centers: Tensor, forward: Tensor, K: Tensor) -> Cameras:
     """Cameras at metric places [t, 3] that look along metric directions [t, 3] with up above them, in scene units."""
-    back = -torch.nn.functional.normalize(forward, dim=1)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=back.dtype).expand_as(back)
-    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=1)
-    turn = torch.stack([right, torch.linalg.cross(back, right), back], dim=2)
+    turn = level_axes(-torch.nn.functional.normalize(forward, dim=1))
     frame, size = scene.frame, scene.cameras
     poses = torch.cat([frame.rotation.T.to(turn) @ turn, frame.to_scene(centers)[:, :, None]], dim=2).float()
     return Cameras.from_opengl(poses, K.repeat(len(poses), 1, 1), size.width, size.height)

@@ -79,6 +79,17 @@ class Cameras:
         return Cameras(self.viewmats, Ks, width, height)
 
 
+def level_axes(back: Float[Tensor, "t 3"]) -> Float[Tensor, "t 3 3"]:
+    """Camera-to-world rotations with OpenGL axes (columns right, up, back) of level cameras, in axes whose z is up.
+
+    Args:
+        back: unit vectors from what the cameras look at to the cameras, not straight up or down.
+    """
+    z = torch.tensor([0.0, 0.0, 1.0]).to(back).expand_as(back)
+    right = torch.nn.functional.normalize(torch.linalg.cross(z, back), dim=1)
+    return torch.stack([right, torch.linalg.cross(back, right), back], dim=2)
+
+
 def interpolate(cameras: Cameras, first: int, last: int, frames: int) -> Cameras:
     """Cameras on the way from one view to another: centres on a straight line, rotations by slerp along the shorter arc.
 

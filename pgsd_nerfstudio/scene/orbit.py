@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.cameras import Cameras, level_axes
 from pgsd_nerfstudio.scene.frame import ground_level, rotation_to_z
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.level import middle_of
@@ -47,10 +47,7 @@ def orbit(gaussians: Gaussians, up: Float64[Tensor, "3"]) -> Cameras:
     centers = _ring(best, floor)
     target = torch.tensor([0.0, 0.0, floor + TARGET * best * math.tan(ELEVATION)], dtype=torch.float64)
     back = torch.nn.functional.normalize(centers - target, dim=1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), back), dim=1)
-    c2w = torch.stack([right, torch.linalg.cross(back, right), back, centers], dim=2)  # OpenGL axes
-    c2w[:, :, :3] = axes.T @ c2w[:, :, :3]
-    c2w[:, :, 3] = c2w[:, :, 3] @ axes + middle
+    c2w = torch.cat([axes.T @ level_axes(back), (centers @ axes + middle)[:, :, None]], dim=2)
     focal = WIDTH / 2 / math.tan(ANGLE_OF_VIEW / 2)
     K = torch.tensor([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
     return Cameras.from_opengl(c2w.float(), K.repeat(VIEWS, 1, 1), WIDTH, HEIGHT)
