@@ -16,7 +16,7 @@ from test_scene_captures_photographs import png16
 
 from pgsd_nerfstudio.plugin import opening
 from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig
-from pgsd_nerfstudio.plugin.model import fidelity
+from pgsd_nerfstudio.plugin.fidelity import fidelity
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.pipeline import WeatherPipeline
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio

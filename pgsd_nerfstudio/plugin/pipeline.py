@@ -28,7 +28,8 @@ from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surroga
 from pgsd_nerfstudio.plugin.datamanager import TrajectoryDataManager, TrajectoryDataManagerConfig
 from pgsd_nerfstudio.plugin.distiller import Distiller, open_prior
 from pgsd_nerfstudio.plugin.environment import RunError
-from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig, fidelity
+from pgsd_nerfstudio.plugin.fidelity import fidelity
+from pgsd_nerfstudio.plugin.model import WeatherModel, WeatherModelConfig
 from pgsd_nerfstudio.plugin.opening import keep_weather, prepare_weather, resumed_weather, stored_weather
 from pgsd_nerfstudio.plugin.options import RunOptions
 from pgsd_nerfstudio.plugin.run_cameras import from_nerfstudio
