@@ -1,7 +1,7 @@
 """Cameras of a COLMAP reconstruction: cameras and images as .bin or .txt, of COLMAP 3 and 4.
 
 COLMAP 4 adds rigs and frames, and still writes every image's own pose to `images`, so these two tables suffice. They are read
-here and not through pycolmap, which also reads all points and tracks, and which one flipped bit can keep busy for ever.
+here and not through pycolmap, which also reads all points and tracks, and which a damaged file can keep busy without end.
 Formats: https://colmap.github.io/format.html; quaternions are wxyz and lead from the world to the camera.
 """
 
