@@ -19,8 +19,11 @@ from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.response.coating import Coating
+from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
-from pgsd_nerfstudio.response.light import encoded, leafy, linear, luminance, mirrored, saturated, under_sky, wetted
+from pgsd_nerfstudio.response.light import encoded, linear, luminance
+from pgsd_nerfstudio.response.weather_light import in_weather
+from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, wet_share
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
@@ -32,11 +35,6 @@ if TYPE_CHECKING:
 FAR = 3000.0  # m; distance of the sky for the haze
 OPAQUE_UNDER = 1.5  # a full cover adds the opacity of this many more Gaussians in the same place
 WIDER_UNDER = 0.25  # relative increase of the scales under a full cover, which closes the gaps between blades and stones
-BLUE_SHADOWS = 0.45  # exponent of the softening by which shadows lose colour
-MIDDLE = 0.18  # linear light of a middle grey
-RELIEF = 0.22  # share of a cover's light that follows the light of the surface below, whose folds are not filled at once
-WAXEN = 0.75  # share of a wet look that leaves do not take on
-SMOOTH = 0.45  # light that wet level ground mirrors, relative to a level film of water
 
 _numbers = itertools.count()
 R = TypeVar("R")
@@ -181,43 +179,22 @@ class Shown:
             ids: indices of these Gaussians in the frozen scene.
             towards: metric unit vectors to the camera; None: wet surfaces mirror nothing.
         """
-        effect, edited = self.answer.effect, self.answer.edits is not None
+        effect, exposure, edited = self.answer.effect, self.answer.exposure, self.answer.edits is not None
         light = linear(rgb)
         # Edited pictures already show light, water and cover; only the mirror, which depends on the camera, is added.
         if effect.ambience is not None and not edited:
-            light = self._in_weather(light, ids, effect.ambience)
+            softening = self.answer.softening
+            light = in_weather(light, effect.ambience, self.share, None if softening is None else softening[ids])
         if effect.surface.landing == "wets":
-            wet = self.wet[ids, None].to(light) * (1 - WAXEN * leafy(light)[:, None])
-            light = light if edited else torch.lerp(light, wetted(light), wet)
+            wet = wet_share(light, self.wet[ids])
+            light = light if edited else darkened(light, wet)
             if towards is not None:
-                light = light + wet * self._mirror(ids, towards, effect.ambience or Ambience())
+                sky = (effect.ambience or Ambience()).sky
+                light = light + wet * mirrored_sky(exposure.normals[ids], exposure.level[ids], exposure.sky[ids], towards, sky)
         if edited:
             return encoded(light)
-        return encoded(torch.lerp(light, self._cover(light, ids), self.hidden[ids, None].to(light)))
-
-    def _cover(self, under: Float[Tensor, "m 3"], ids: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
-        """Light of the cover, from the light of the Gaussians below it."""
-        relief = 1 - RELIEF + RELIEF * (luminance(under)[:, None] / MIDDLE).clamp_max(1.5)
-        own = linear(torch.tensor(self.answer.effect.appearance.collided.rgb).to(under))
-        return own * relief * under_sky(self.answer.exposure.sky[ids].to(under))
-
-    def _in_weather(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], ambience: Ambience) -> Float[Tensor, "m 3"]:
-        share = self.share
-        factor = 1 + share * (2.0**ambience.stops * torch.tensor(ambience.tint).to(light) - 1)
-        light = saturated(light * factor, 1 + share * (ambience.saturation - 1))
-        if self.answer.softening is None:
-            return light
-        softened = 1 + share * (self.answer.softening[ids, None].to(light) - 1)
-        # Shadows in the scene are lit by the blue sky alone, but clouds are white.
-        grey = luminance(light)[:, None]
-        return softened * torch.lerp(grey, light, softened.clamp_min(1.0) ** -BLUE_SHADOWS)
-
-    def _mirror(self, ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"], ambience: Ambience) -> Float[Tensor, "m 3"]:
-        exposure = self.answer.exposure
-        cosine = (exposure.normals[ids].to(towards) * towards).sum(1)
-        smooth = SMOOTH * exposure.level[ids].to(towards) ** 2
-        sky = linear(torch.tensor(ambience.sky).to(towards))
-        return (smooth * mirrored(cosine) * (cosine > 0) * exposure.sky[ids].to(towards))[:, None] * sky
+        cover = cover_light(light, effect.appearance.collided.rgb, exposure.sky[ids])
+        return encoded(torch.lerp(light, cover, self.hidden[ids, None].to(light)))
 
 
 def _mapped(record: R, change: Callable[[Tensor], Tensor]) -> R:

@@ -1,0 +1,43 @@
+"""The light of wet frozen Gaussians: water darkens their own light and mirrors the sky."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pgsd_nerfstudio.response.light import leafy, linear, mirrored, wetted
+
+WAXEN = 0.75  # share of a wet look that leaves do not take on
+SMOOTH = 0.45  # light that wet level ground mirrors, relative to a level film of water
+
+
+def wet_share(light: Float[Tensor, "m 3"], wet: Float[Tensor, " m"]) -> Float[Tensor, "m 1"]:
+    """Share of a wet look that Gaussians of linear light take on, from the share of them that is wet."""
+    return wet[:, None].to(light) * (1 - WAXEN * leafy(light)[:, None])
+
+
+def darkened(light: Float[Tensor, "m 3"], share: Float[Tensor, "m 1"]) -> Float[Tensor, "m 3"]:
+    """Linear light of Gaussians that have a share of a wet look, without what they mirror."""
+    return torch.lerp(light, wetted(light), share)
+
+
+def mirrored_sky(
+    normals: Float[Tensor, "m 3"],
+    level: Float[Tensor, " m"],
+    seen: Float[Tensor, " m"],
+    towards: Float[Tensor, "m 3"],
+    sky: tuple[float, float, float],
+) -> Float[Tensor, "m 3"]:
+    """Linear light of the sky that wet Gaussians mirror.
+
+    Args:
+        normals: unit, in the metric frame.
+        level: of each Gaussian, as Exposure.level.
+        seen: share of the sky that each sees.
+        towards: metric unit vectors to the camera.
+        sky: sRGB of the sky.
+    """
+    cosine = (normals.to(towards) * towards).sum(1)
+    smooth = SMOOTH * level.to(towards) ** 2
+    return (smooth * mirrored(cosine) * (cosine > 0) * seen.to(towards))[:, None] * linear(torch.tensor(sky).to(towards))
