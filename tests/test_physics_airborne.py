@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.effects.effect import Wind
-from pgsd_nerfstudio.physics.air.airborne import _SINE, Flutter, advance
+from pgsd_nerfstudio.physics.air.airborne import _SINE, Flutter, advance, air_velocity
 from pgsd_nerfstudio.physics.air.deflection import Deflection
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import GRAVITY
@@ -66,6 +66,15 @@ def test_the_kernel_feels_the_wind_of_the_plain_form(dtype, tolerance):
     velocity, at = np.zeros_like(position), position.astype(np.float64)
     advance(position, velocity, np.full(200, 1e-9, dtype), Flutter.none(200, dtype), WIND, 1.5, 0.04)
     np.testing.assert_allclose(velocity, WIND.velocity(at, 1.52), atol=tolerance)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 3e-7), (np.float32, 3e-5)])
+def test_air_that_newcomers_meet_is_that_of_the_plain_form(dtype, tolerance):
+    position, _, _ = particles(200, dtype)
+    position[:50, 2] -= 4  # some near and below the ground
+    at = position.copy()
+    np.testing.assert_allclose(air_velocity(position, WIND, 1.5), WIND.velocity(at.astype(np.float64), 1.5), atol=tolerance)
+    np.testing.assert_array_equal(position, at)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 3e-7), (np.float32, 3e-5)])

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import Effect
-from pgsd_nerfstudio.physics.air.airborne import Flutter, advance
+from pgsd_nerfstudio.physics.air.airborne import Flutter, advance, air_velocity
 from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.air.emitters import Sizes, feed, fill
 from pgsd_nerfstudio.physics.air.sight import Sight
@@ -61,7 +61,7 @@ class Air:
             speeds: [n] terminal speeds, m/s.
             time: s.
         """
-        velocity = self.wind.velocity(positions.astype(np.float64), time)
+        velocity = air_velocity(positions.astype(np.float32), self.wind, time)
         velocity[:, 2] -= speeds
         return velocity
 
@@ -78,7 +78,7 @@ class Air:
         if self.effect.surface.landing == "glides":
             return np.zeros(len(positions), bool)
         # The undisturbed wind is taken: with the updraft before a wall, particles would seem to come from the ground.
-        came = self.wind.undisturbed.velocity(positions.astype(np.float64), time)
+        came = air_velocity(positions.astype(np.float32), self.wind.undisturbed, time)
         came[:, 2] -= speeds
         return ~self.ground.open_above(positions, -came)
 

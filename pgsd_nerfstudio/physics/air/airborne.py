@@ -26,6 +26,9 @@ from pgsd_nerfstudio.physics.laws.boundary_layer import CALM
 _SINE = (6.283185160088967, -41.34165503128624, 81.60100406452872, -76.54978208076217, 39.53670436361769)
 
 
+SETTLE = 1e-3  # s; a thousand of the shortest relaxation times in the kernel
+
+
 @dataclass(frozen=True)
 class Flutter:
     """Flutter of n particles."""
@@ -85,6 +88,21 @@ def advance(
         np.array(_SINE, number),
         *_obstacles(wind, mean, position.dtype),
     )
+
+
+def air_velocity(points: Float[ndarray, "n 3"], wind: WindField, time: float) -> Float[ndarray, "n 3"]:
+    """Velocity of the air in m/s, by the kernel that moves the particles.
+
+    Args:
+        points: m, z up; float32 or float64, which is also the precision of the result.
+        wind: the moving air.
+        time: s.
+    """
+    # Bodies without weight that start at rest have the velocity of the air after a step of many relaxation times, and the
+    # kernel takes the wind where they start, in the middle of the step.
+    velocity, nothing = np.zeros_like(points), np.zeros(len(points), points.dtype)
+    advance(points.copy(), velocity, nothing, Flutter(nothing, nothing, nothing), wind, time - 0.5 * SETTLE, SETTLE)
+    return velocity
 
 
 def _obstacles(wind: WindField, mean: Float[ndarray, "2"], dtype: np.dtype) -> tuple[ndarray | None, ...]:
