@@ -33,6 +33,7 @@ def falling(count: int = 60, frames: int = 40, seed: int = 0) -> ParticleHistory
         quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=1),
         diameters=torch.full((count,), 0.005),
         represents=torch.ones(count),
+        reaches=torch.full((count,), 1e9),
         kinds=torch.zeros(count, dtype=torch.uint8),
         fps=25.0,
         frames=frames,

@@ -46,6 +46,7 @@ def test_matter_rests_on_the_floor_in_large_cells_too(monkeypatch):
         velocities=np.zeros((n, 3), np.float32),
         **{name: np.zeros(n, np.float32) for name in ("speeds", "diameters", "sways", "hertz", "phases", "holds", "spins")},
         represents=np.ones(n, np.float32),
+        reaches=np.full(n, 1e9, np.float32),
         kinds=np.zeros(n, np.uint8),
     )
     heap.add(bodies, np.full(n, 1e-4))

@@ -35,6 +35,7 @@ def history() -> ParticleHistory:
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
         diameters=torch.full((3,), 0.005),
         represents=torch.ones(3),
+        reaches=torch.full((3,), 1e9),
         kinds=torch.tensor([0, 2, 5], dtype=torch.uint8),
         fps=25.0,
         frames=6,
@@ -142,6 +143,7 @@ def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_
         births=np.zeros(count, np.int32),
         diameters=one,
         represents=one,
+        reaches=1e9 * one,
         quats=np.ones((count, 4), np.float32),
         kind_ids=np.array([1, 3], np.int32),
         kind_bits=np.array([2, 5], np.uint8),
@@ -166,8 +168,8 @@ def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_
 
 
 def test_its_size_is_that_of_its_tensors(history):
-    # Per particle 2 int32, 1 bool, 1 uint8, 3 + 4 + 4 + 4 float32 (place, two orientations, four lengths and counts).
-    assert history.nbytes == 7 * 12 + 4 * 8 + 3 * (8 + 1 + 1 + 15 * 4)
+    # Per particle 2 int32, 1 bool, 1 uint8, 3 + 4 + 4 + 5 float32 (place, two orientations, five lengths and counts).
+    assert history.nbytes == 7 * 12 + 4 * 8 + 3 * (8 + 1 + 1 + 16 * 4)
 
 
 def test_nan_is_not_saved(history, tmp_path):

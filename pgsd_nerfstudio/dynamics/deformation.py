@@ -98,6 +98,7 @@ def scattered(box: Float[Tensor, "2 3"], like: ParticleHistory, count: int, *, s
         quats=like.quats[chosen],
         diameters=like.diameters[chosen],
         represents=like.represents[chosen],
+        reaches=like.reaches[chosen],
         kinds=torch.zeros_like(like.kinds[chosen]),
         fps=like.fps,
         frames=like.frames,
@@ -176,7 +177,7 @@ class DeformedCloud(GaussianSequence):
         ids, moved, quats, change = now
         look = changed(initial.active.select(ids), change)
         places = self.history.positions_at(0, ids) + moved
-        gaussians = Gaussians(places, quats, look.scales, look.opacity, look.rgb)
+        gaussians = Gaussians(places, quats, look.scales, look.opacity, look.rgb, antialiased=True, whole=True)
         deltas = None if before is None else _deltas(before, now)
         return RolloutFrame(frame, gaussians, ids, ids[:0], moved, quats, self.history.quats[ids], deltas)
 

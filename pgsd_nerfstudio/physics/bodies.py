@@ -16,6 +16,7 @@ from numpy import ndarray
 GRAVITY = 9.81  # m/s^2, in all motion here; the fits in laws.fall_speeds were made with the standard 9.80665
 LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; a particle that has not ended is active
 ENDS = {"landed": LANDED, "absorbed": ABSORBED, "left": LEFT, "unseen": UNSEEN}
+ANY_DISTANCE = np.float32(1e9)  # m; the reach of a particle that is shown however far it is
 SPLASHED, SLID, DENSE = 1, 2, 4  # bits of `kinds`: the particle is a splash droplet, has slid, has been dense matter
 
 
@@ -44,6 +45,8 @@ class Bodies:
     """Turns about the surface normal after landing."""
     represents: Float[ndarray, " n"]
     """Real particles that each particle represents."""
+    reaches: Float[ndarray, " n"]
+    """Metres up to which each particle is told apart by a camera; it is simulated only where it may come so near to one."""
     kinds: UInt8[ndarray, " n"]
     """Bits SPLASHED, SLID and DENSE."""
 

@@ -21,7 +21,7 @@ from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.air.emitters import Sizes, feed, fill
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
-from pgsd_nerfstudio.physics.bodies import Bodies
+from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.landing import Ground
 from pgsd_nerfstudio.physics.laws.populations import fall_speed
@@ -108,6 +108,7 @@ class Air:
             holds=draw[3].astype(np.float32),
             spins=draw[4].astype(np.float32),
             represents=self.sizes.represents(diameters).astype(np.float32),
+            reaches=np.full(count, ANY_DISTANCE),
             kinds=np.zeros(count, np.uint8),
         )
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from pgsd_nerfstudio.physics.bodies import LANDED, LEFT, Bodies, RunState, random_orientations
+from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, LANDED, LEFT, Bodies, RunState, random_orientations
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.ground.landing import SMALLEST, Ground, RestPose
 from pgsd_nerfstudio.physics.record.chunks import Chunk, assemble
@@ -107,6 +107,7 @@ class RunRecord:
             births=np.concatenate([np.full(count, frame, np.int32) for frame, count in self._births]),
             diameters=np.full(self.born, self.diameter, np.float32),
             represents=np.ones(self.born, np.float32),
+            reaches=np.full(self.born, ANY_DISTANCE),
             quats=random_orientations([seed, 0x0417], self.born),
             kind_ids=nothing,
             kind_bits=no_bits,

@@ -36,6 +36,8 @@ class Chunk:
     """Metres."""
     represents: Float[ndarray, " b"]
     """Real particles that each particle represents."""
+    reaches: Float[ndarray, " b"]
+    """Metres up to which a camera shows each particle."""
     quats: Float[ndarray, "b 4"]
     """Orientation while active, wxyz."""
     kind_ids: Int[ndarray, " k"]
@@ -148,6 +150,7 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         "quats": joined("quats"),
         "diameters": joined("diameters"),
         "represents": joined("represents"),
+        "reaches": joined("reaches"),
         "kinds": kinds,
     }
     last = chunks[-1].state

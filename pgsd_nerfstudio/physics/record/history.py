@@ -58,6 +58,8 @@ class ParticleHistory:
     """Metres."""
     represents: Float[Tensor, " p"]
     """Real particles that each particle represents."""
+    reaches: Float[Tensor, " p"]
+    """Metres up to which a camera shows each particle; `physics.air.emitters` draws them. 1e9: at any distance."""
     kinds: UInt8[Tensor, " p"]
     """Bits: 1 the particle is a splash droplet, 2 it has slid, 4 it has been dense matter."""
     fps: float
@@ -196,7 +198,7 @@ class ParticleHistory:
         return self.offsets[ids] + (frame - self.births[ids])
 
 
-_FORMAT = 2
+_FORMAT = 3
 _TENSORS = tuple(f.name for f in fields(ParticleHistory) if f.name not in ("fps", "frames", "about"))
 _LISTS = ("steps", "steps_two", "steps_four")  # names of the encoded positions in a file
 _STORED = (set(_TENSORS) - {"positions"}) | set(_LISTS)

@@ -94,6 +94,7 @@ class Log:
             births=_joined([np.full(len(entering), frame, np.int32) for frame, entering in self._births], np.int32),
             diameters=new.diameters,
             represents=new.represents,
+            reaches=new.reaches,
             quats=random_orientations([seed, self.start, 0x0417], self.born - self.first),
             kind_ids=changed.ids,
             kind_bits=changed.kinds,
