@@ -58,13 +58,32 @@ def test_positions_belong_to_their_frames(history):
 
 
 def test_displacement_is_to_the_frame_before(history):
-    assert history.displacement_at(2, torch.tensor([0]))[0].tolist() == [2, 0, -2]
+    assert history.displacement_at(1, torch.tensor([0]))[0].tolist() == [1, 0, -1]
     assert history.displacement_at(5, torch.tensor([1]))[0].tolist() == [4, 0, -4]
 
 
 def test_displacement_in_the_first_frame_is_the_first_step(history):
     assert history.displacement_at(3, torch.tensor([1]))[0, 0] == 2
     assert history.displacement_at(0, torch.tensor([0]))[0, 0] == 1
+
+
+def test_a_contact_cuts_a_step_short_and_not_the_displacement_of_a_shutter(history):
+    """A drop of 8 m/s that arrives 1 cm after the beginning of its last frame still streaks by 32 cm a frame."""
+    heights = torch.tensor([1.0, 0.68, 0.36, 0.35])
+    drop = replace(
+        history.select(torch.tensor([1])),
+        births=torch.tensor([0]).int(),
+        ends=torch.tensor([4]).int(),
+        offsets=torch.tensor([0, 4]),
+        positions=torch.stack([torch.zeros(4), torch.zeros(4), heights], 1),
+        kinds=torch.zeros(1, dtype=torch.uint8),
+    )
+    fell = [drop.displacement_at(frame, torch.tensor([0]))[0, 2].item() for frame in range(4)]
+    assert fell == pytest.approx([-0.32] * 4, abs=1e-6)
+    slid = replace(drop, kinds=torch.tensor([2], dtype=torch.uint8))
+    assert slid.displacement_at(3, torch.tensor([0]))[0, 2].item() == pytest.approx(-0.01, abs=1e-6)
+    in_view = replace(drop, frames=4)  # the run ends before the drop does
+    assert in_view.displacement_at(3, torch.tensor([0]))[0, 2].item() == pytest.approx(-0.01, abs=1e-6)
 
 
 def test_displacement_is_zero_for_a_single_frame(history):

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from pgsd_nerfstudio.physics.bodies import DENSE, SLID
 from pgsd_nerfstudio.physics.record.codec import Steps, decode, encode
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
@@ -106,20 +107,24 @@ class ParticleHistory:
         return self.positions[self._rows(frame, ids)]
 
     def displacement_at(self, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Displacements x(frame) - x(frame - 1) of particles in metres.
+        """Displacements of particles in metres within one frame at the velocity that they have at `frame`.
 
-        In the frame of birth the displacement is that of the next frame, x(birth + 1) - x(birth), as if the particle had
-        entered with that velocity. It is zero for a particle that is active in one frame only.
+        That is x(frame) - x(frame - 1), with two exceptions. In the frame of birth it is the displacement of the next frame, as
+        if the particle had entered with that velocity. In the last frame of a particle that flew into something it is that of
+        the frame before, since a contact cuts its last step short and not the velocity with which it arrives. It is zero for a
+        particle that is active in one frame only.
 
         Args:
             frame: the frame.
             ids: particles that are active in that frame.
         """
-        rows = self._rows(frame, ids)
-        born = self.births[ids] == frame
+        rows, first = self._rows(frame, ids), self.offsets[ids]
         last = self.offsets[ids + 1] - 1
-        here = torch.where(born, torch.minimum(rows + 1, last), rows)
-        return self.positions[here] - self.positions[torch.where(born, rows, rows - 1)]
+        flew = (self.kinds[ids] & (SLID | DENSE)) == 0
+        cut_short = (rows == last) & (self.ends[ids] < self.frames) & flew
+        here = torch.where(rows == first, torch.minimum(rows + 1, last), rows - cut_short.long())
+        here = torch.maximum(here, torch.minimum(first + 1, last))
+        return self.positions[here] - self.positions[torch.maximum(here - 1, first)]
 
     def window(self, start: int, stop: int) -> Window:
         """Dense trajectories of the particles that are active in any frame of a window.
