@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.medium import Froxels, Medium
 from pgsd_nerfstudio.rendering.reference import render_reference
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -51,7 +52,7 @@ def test_walls_fade_into_airlight_as_beer_and_lambert_say(rasterizer, visibility
         bare = wall(distance, own[None])
         shaded = wall(distance, medium.through(bare.colors, bare.means, torch.eye(4), *LENS))
         clip = CpuRasterizer(shaded).render(cameras) if rasterizer == "cpu" else render_reference(cameras, shaded)
-        return (clip.rgb[0, 16, 24] / clip.accumulation[0, 16, 24, None]).double().mean().item()
+        return linear(clip.rgb[0, 16, 24] / clip.accumulation[0, 16, 24, None]).double().mean().item()
 
     assert seen(WHITE, BLACK) == pytest.approx(expected, rel=1e-4)
     assert seen(BLACK, WHITE) == pytest.approx(1 - expected, rel=1e-4)
@@ -69,7 +70,7 @@ def test_the_way_of_the_light_counts_and_not_the_depth_along_the_axis():
 def test_gradients_reach_the_colours_dimmed_by_what_the_air_lets_through(extinction):
     medium, means = Medium(WHITE.double(), extinction), before(TURNED, 12, 1.0, 20.0)
     rgb = torch.rand(12, 3, dtype=torch.float64, requires_grad=True)
-    medium.through(rgb, means, TURNED, *LENS).sum().backward()
+    linear(medium.through(encoded(rgb), means, TURNED, *LENS)).sum().backward()
     expected = torch.exp(-0.3 * (means - torch.linalg.inv(TURNED)[:3, 3]).norm(dim=1))
     assert rgb.grad is not None
     torch.testing.assert_close(rgb.grad, expected[:, None].expand(12, 3))
@@ -142,6 +143,17 @@ def test_the_same_view_is_sampled_once():
     assert len(asked) == 1
 
 
+def test_half_of_the_light_of_a_white_wall_is_shown_as_half_of_the_light_and_not_of_the_display_value():
+    half = Medium(BLACK, math.log(2.0)).through(WHITE[None], torch.tensor([[0.0, 0, 1]]), torch.eye(4), *LENS)
+    assert half[0].tolist() == pytest.approx([0.5 ** (1 / 2.2)] * 3, rel=1e-5)  # 0.73, where sRGB has 0.735
+
+
+def test_black_in_clear_air_has_finite_gradients():
+    rgb = torch.zeros(1, 3, requires_grad=True)
+    Medium(BLACK, 0.1).through(rgb, torch.tensor([[0.0, 0, 1]]), torch.eye(4), *LENS).sum().backward()
+    assert rgb.grad is not None and rgb.grad.isfinite().all()
+
+
 def test_what_has_the_colour_of_the_air_keeps_it():
     airlight = torch.tensor([0.3, 0.6, 0.8])
     means = before(TURNED, 20, 1.0, 90.0).float()
@@ -153,9 +165,10 @@ def test_what_has_the_colour_of_the_air_keeps_it():
 def test_the_background_is_seen_from_its_distance():
     sky, airlight = torch.tensor([0.1, 0.4, 0.9]), torch.tensor([0.8, 0.7, 0.6])
     even = Medium(airlight, 0.02).behind(sky, torch.eye(4), *LENS, far=30.0)
-    torch.testing.assert_close(even, sky * math.exp(-0.6) + airlight * (1 - math.exp(-0.6)))
+    light, share = linear(torch.stack([sky, airlight])), math.exp(-0.6)
+    torch.testing.assert_close(even, encoded(light[0] * share + light[1] * (1 - share)))
     unseen = Medium(airlight, 0.02).behind(None, torch.eye(4), *LENS, far=30.0)
-    torch.testing.assert_close(unseen, airlight * (1 - math.exp(-0.6)))
+    torch.testing.assert_close(unseen, encoded(light[1] * (1 - share)))
 
 
 @pytest.mark.parametrize("far", [0.7, 25.0, 300.0])

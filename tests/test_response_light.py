@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
+from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.light import (  # fmt: skip
-    encoded,
     leafy,
-    linear,
     luminance,
     mirrored,
     saturated,

@@ -17,11 +17,12 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
+from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
-from pgsd_nerfstudio.response.light import encoded, linear, luminance
+from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.weather_light import in_weather
 from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, wet_share
 from pgsd_nerfstudio.scene.gaussians import Gaussians

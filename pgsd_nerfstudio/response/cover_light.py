@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.response.light import linear, luminance, under_sky
+from pgsd_nerfstudio.rendering.display import linear
+from pgsd_nerfstudio.response.light import luminance, under_sky
 
 MIDDLE = 0.18  # linear light of a middle grey
 RELIEF = 0.22  # share of a cover's light that follows the light of the surface below, whose folds are not filled at once

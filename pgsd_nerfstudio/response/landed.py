@@ -11,8 +11,9 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.answer import Answer
-from pgsd_nerfstudio.response.light import encoded, linear, under_sky
+from pgsd_nerfstudio.response.light import under_sky
 
 NEIGHBOURS = 8  # frozen Gaussians whose share of the sky is averaged, since it is noisy by the number of rays
 

@@ -12,23 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-GAMMA = 2.2  # approximates sRGB, which suffices since light is changed by factors and not measured
 WATER = 1.33  # index of refraction
 DRY_ASYMMETRY, WET_ASYMMETRY = 0.80, 0.92
 """Asymmetry of grains in air and in water. Twomey et al. take up to 0.97 for grains in water; surfaces soak up less."""
 LEAST_GREEN, MOST_GREEN = 0.05, 0.25  # excess of green in linear light: that of grey stone with moss, and that of leaves
 SHELTERED = (0.42, 0.46, 0.55)  # linear light without any sky; it is bluish and comes from the surroundings
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue (Rec. 709)
-
-
-def linear(rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Linear light of sRGB values; values below 0 give 0, values above 1 continue the curve."""
-    return rgb.clamp_min(0.0) ** GAMMA
-
-
-def encoded(light: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """sRGB values of linear light."""
-    return light.clamp_min(0.0) ** (1 / GAMMA)
 
 
 def luminance(light: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

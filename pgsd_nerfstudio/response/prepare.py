@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import domain_of
+from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
@@ -19,7 +20,7 @@ from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import LEVEL, Exposure
 from pgsd_nerfstudio.response.haze_field import HazeField
-from pgsd_nerfstudio.response.light import linear, luminance
+from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene

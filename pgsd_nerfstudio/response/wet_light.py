@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pgsd_nerfstudio.response.light import leafy, linear, mirrored, wetted
+from pgsd_nerfstudio.rendering.display import linear
+from pgsd_nerfstudio.response.light import leafy, mirrored, wetted
 
 WAXEN = 0.75  # share of a wet look that leaves do not take on
 SMOOTH = 0.45  # light that wet level ground mirrors, relative to a level film of water

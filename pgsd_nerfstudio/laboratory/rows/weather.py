@@ -17,6 +17,7 @@ from pgsd_nerfstudio.laboratory.rows import weather_ground as rows_weather_groun
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.rendering.medium import Medium
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.rendering.reference import render_reference
@@ -81,7 +82,7 @@ def _fog(scene: Scene) -> Iterator[Record]:
 
 
 def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, reference: bool) -> float:
-    """Brightness of a white wall through even fog of black airlight, or of a black wall through white airlight.
+    """Linear light of a white wall through even fog of black airlight, or of a black wall through white airlight.
 
     Args:
         scene: its frame gives the scale.
@@ -109,8 +110,8 @@ def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, r
         seen = CpuRasterizer(wall).render(cameras, None, torch.full((3,), float(not white_wall)), moment)
     # One Gaussian is never quite opaque; the light behind it is subtracted, since it has nothing to do with the fog.
     share = seen.accumulation[0, 8, 8]
-    through = seen.rgb[0, 8, 8].mean() - (1 - share) * moment.seen_behind.mean()
-    return float(through / share)
+    through = seen.rgb[0, 8, 8] - (1 - share) * moment.seen_behind
+    return float(linear(through / share).mean())
 
 
 class _Air:
