@@ -1,7 +1,9 @@
-"""Antialiased Gaussians: the blur of a pixel takes from their peak what it adds to their area, on every rasterizer."""
+"""Antialiased Gaussians: the blur of a pixel takes from their peak what it adds to their area, on every rasterizer. Whole ones
+lose nothing to the smallest alpha that is drawn either."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,7 +14,7 @@ from test_rendering_image import assert_same_picture
 
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
-from pgsd_nerfstudio.rendering.reference import project_reference, render_reference
+from pgsd_nerfstudio.rendering.reference import certain_pixels, project_reference, render_reference
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians, relative_error
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -25,6 +27,10 @@ BOTH = [(True, False), (False, True), (True, True)]
 
 def antialiased(gaussians: Gaussians, yes: bool = True) -> Gaussians:
     return replace(gaussians, antialiased=yes)
+
+
+def whole(gaussians: Gaussians) -> Gaussians:
+    return replace(gaussians, antialiased=True, whole=True)
 
 
 def test_opacities_on_the_image_plane_are_those_of_gsplat():
@@ -77,13 +83,60 @@ def test_picture_equals_the_reference(frozen, moving, moves, size):
     assert_same_picture(cameras, CpuRasterizer(scene).render(cameras, dynamic), [scene, dynamic])
 
 
+@pytest.mark.parametrize("layers", [None, 1])
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("size", [0.002, 0.15])
+def test_a_picture_of_what_is_whole_equals_the_reference(moves, size, layers):
+    """Sharp frozen scenes in one picture with whole and moving ones, each by its own rule; one layer, behind all that moves."""
+    cameras, dynamic = random_cameras(2, 48, 40), whole(moving_gaussians(100, degree=None, moves=moves))
+    dynamic = replace(dynamic, scales=dynamic.scales * (size / 0.15))
+    scene = random_gaussians(200, 1, degree=1)
+    if layers:
+        scene = scene.select(scene.means[:, 2] > 6.0)
+        dynamic = replace(dynamic, means=dynamic.means.clamp(max=4.0))
+    found = CpuRasterizer(scene, layers=layers).render(cameras, dynamic)
+    if layers is None:
+        assert_same_picture(cameras, found, [scene, dynamic])
+    certain = certain_pixels(cameras, [scene, dynamic])
+    assert certain.double().mean() > 0.9
+    expected = render_reference(cameras, [scene, dynamic])
+    assert (found.rgb - expected.rgb)[certain].abs().max() < (1e-3 if layers else 2e-5)
+
+
+@pytest.mark.parametrize("moved", [None, (0.02, 0.01, 0.0)])
+@pytest.mark.parametrize("opacity", [0.9, 0.05, 0.002])
+def test_many_particles_cover_the_sum_of_their_areas_at_every_resolution(moved, opacity):
+    """Particles of a hundredth to a sixth of a pixel, fainter than what is drawn of one pixel: the share of the picture that
+    they cover is what Beer-Lambert says of their areas."""
+    generator, n = torch.Generator().manual_seed(0), 100_000
+    places = torch.rand(n, 3, generator=generator) * torch.tensor([2.0, 2.0, 0.0]) + torch.tensor([-1.0, -1.0, 100.0])
+    scales = 0.001 * (1.0 + torch.rand(n, 1, generator=generator)).expand(n, 3)
+    moves = None if moved is None else torch.tensor([moved]).expand(n, 3)
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
+    some = whole(Gaussians(places, upright, scales, torch.full((n,), opacity), torch.ones(n, 3), moves))
+    expected = 1.0 - math.exp(-float(2 * math.pi * opacity * scales[:, 0].square().sum()) / 4.0)  # of 4 square units
+    for width in (20, 40, 160):
+        K = torch.tensor([[[50.0 * width, 0.0, width / 2], [0.0, 50.0 * width, width / 2], [0.0, 0.0, 1.0]]])
+        cameras = Cameras(torch.eye(4)[None], K, width, width)
+        inner = slice(width // 8, -(width // 8))  # what is near the rim sends light out of the picture
+        clips = [CpuRasterizer(Gaussians.empty()).render(cameras, some)]
+        if width == 40:
+            clips.append(render_reference(cameras, [Gaussians.empty(), some]))
+        for clip in clips:
+            found = clip.accumulation[0, inner, inner]
+            # The faintest meet some pixels with alpha 1 / 255 each; three standard deviations of that number are allowed.
+            chance = 3.0 / math.sqrt(255.0 * expected * found.numel())
+            assert found.mean().item() == pytest.approx(expected, rel=0.02 + chance)
+
+
+@pytest.mark.parametrize("make", [antialiased, whole])
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("size", [0.03, 0.15])
-def test_gradients_equal_those_of_the_reference(moves, size):
+def test_gradients_equal_those_of_the_reference(moves, size, make):
     dynamic = random_gaussians(100, 50, size=size)
     if moves:
         dynamic = replace(dynamic, displacements=0.4 * torch.randn(100, 3, generator=torch.Generator().manual_seed(3)))
-    found = gradients(random_cameras(2, 48, 40), random_gaussians(200), antialiased(dynamic))
+    found = gradients(random_cameras(2, 48, 40), random_gaussians(200), make(dynamic))
     for name, (gradient, expected) in found.items():
         assert relative_error(gradient, expected) < 1e-4, name
 
@@ -94,6 +147,7 @@ def test_around_gsplats_kernels_picture_and_gradients_are_those_of_the_reference
     scene = antialiased(random_gaussians(60, 1, degree=1), frozen)
     dynamic = antialiased(moving_gaussians(40, degree=None, moves=moves), moving)
     assert_same_picture_and_gradients(OnAnyDevice(scene), scene, dynamic, "cpu")
+    assert_same_picture_and_gradients(OnAnyDevice(scene), scene, replace(dynamic, whole=True), "cpu")
 
 
 def test_what_has_no_area_takes_no_light_and_has_finite_gradients():

@@ -228,6 +228,8 @@ class Rollout(GaussianSequence):
             looks.opacity,
             looks.rgb,
             self._displacements(state),
+            antialiased=True,
+            whole=True,
         )
         simulated_quats = history.quats[state.active]
         return RolloutFrame(state.frame, gaussians, state.active, state.collided, offset, state.quats, simulated_quats, deltas)

@@ -125,22 +125,19 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     return InitialLook(active, collided, looks.collided.settle_seconds).to(particles.diameters.device)
 
 
-FAINTEST = 1.0 / 255.0  # opacity below which a rasterizer draws nothing
-
-
 def opacity_of_extinction(cross_section: Float[Tensor, " p"], scales: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
     """Opacity with which a Gaussian takes as much light out of a view as a black area that is spread over it.
 
     Many such Gaussians then obey Beer-Lambert. The optical depth -ln(1 - a g) of a splat a g, g = exp(-r^2 / 2), integrates to
-    2 pi s^2 (Li2(a) - Li2(1 / 255)), as a rasterizer draws nothing fainter than 1 / 255; s is the geometric mean of the axes.
+    2 pi s^2 Li2(a) (particles are drawn whole, see `Gaussians`); s is the geometric mean of the axes.
 
     Args:
         cross_section: black area in m^2.
         scales: standard deviations in metres.
     """
     wanted = cross_section.double() / (2 * math.pi * scales.double().prod(1) ** (2 / 3))
-    opacity = np.linspace(FAINTEST, 0.99, 4096)
-    depth = spence(1 - opacity) - spence(1 - FAINTEST)  # Li2(z) = spence(1 - z)
+    opacity = np.linspace(0.0, 0.99, 4096)
+    depth = spence(1 - opacity)  # Li2(z) = spence(1 - z)
     return torch.from_numpy(np.interp(wanted.numpy(), depth, opacity)).float()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,10 +85,18 @@ class CpuRasterizer:
                 if moment is not None:
                     colors = moment.moving_colors(colors, moving.means, Viewpoint.of(cameras, k, moving.means))
                 tensors = {**moving.tensors, "colors": colors}
-                frames.append(_RenderMerged.apply(view, frozen, self.config, moving.antialiased, *tensors.values()))
+                drawn = _Drawn(moving.antialiased, moving.whole)
+                frames.append(_RenderMerged.apply(view, frozen, self.config, drawn, *tensors.values()))
         clip = torch.stack(frames)
         behind = backgrounds(background, cameras, at, clip)
         return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], behind)
+
+
+class _Drawn(NamedTuple):
+    """Fields of Gaussians that are no tensors."""
+
+    antialiased: bool
+    whole: bool
 
 
 class _Walk(NamedTuple):
@@ -98,7 +105,7 @@ class _Walk(NamedTuple):
     view: View
     part: Binned | Layers
     dynamic: Binned
-    antialiased: bool
+    drawn: _Drawn
     ids: np.ndarray
     """[m] int32: the index of the Gaussian of each splat in `dynamic`."""
     limits: tuple[np.float32, np.float32]
@@ -111,15 +118,15 @@ class _RenderMerged(torch.autograd.Function):
     """One frame [5, h, w] as in blending.py, with gradients for the tensors of its dynamic Gaussians."""
 
     @staticmethod
-    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, antialiased: bool, *tensors: Tensor) -> Tensor:
-        dynamic, ids = splat(replace(Gaussians(*tensors), antialiased=antialiased), view)
+    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, drawn: _Drawn, *tensors: Tensor) -> Tensor:
+        dynamic, ids = splat(Gaussians(*tensors, **drawn._asdict()), view)
         image = frozen.image.copy()
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
         scene = dynamic, width, height, *limits, image
         blend_merged(frozen.part, *scene)
         ctx.save_for_backward(*tensors)
-        ctx.walk = _Walk(view, frozen.part, dynamic, antialiased, ids, limits, image)
+        ctx.walk = _Walk(view, frozen.part, dynamic, drawn, ids, limits, image)
         return torch.from_numpy(image)
 
     @staticmethod
@@ -132,7 +139,7 @@ class _RenderMerged(torch.autograd.Function):
 
 def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:
     """Gradients of the tensors of the dynamic Gaussians, in the order of these tensors."""
-    view, part, dynamic, antialiased, ids, limits, image = walk
+    view, part, dynamic, drawn, ids, limits, image = walk
     lens = view.lens
     to_splats = np.zeros((workers(), len(ids), GRADIENT_COLUMNS), np.float32)
     scene = dynamic, lens.width, lens.height, *limits, image, float_array(to_image), to_splats
@@ -141,6 +148,6 @@ def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tens
     motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
     found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]
     outputs = found if len(motions) else [*found, np.zeros((0, 3), np.float32)]
-    projected = means, quats, scales, motions, antialiased, view.viewmat, lens
+    projected = means, quats, scales, motions, *drawn, view.viewmat, lens
     project_backward(*projected, ids, dynamic.splats, totals, *outputs)
     return [torch.from_numpy(gradient) for gradient in found]

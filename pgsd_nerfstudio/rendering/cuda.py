@@ -174,7 +174,7 @@ class GsplatRasterizer:
         turn = view.viewmat[:3, :3]
         points = gaussians.means @ turn.T + view.viewmat[:3, 3]
         to_image = perspective_jacobians(points, view.K, view.width, view.height, self.config.frustum_margin) @ turn
-        return footprint_opacities(gaussians, to_image, self.config.blur)
+        return footprint_opacities(gaussians, to_image, self.config.blur, self.config.min_alpha)
 
 
 def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:

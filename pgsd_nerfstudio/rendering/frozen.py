@@ -79,6 +79,7 @@ def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple
         float_array(gaussians.opacities),
         motions_array(gaussians),
         gaussians.antialiased,
+        gaussians.whole,
         view.viewmat,
         view.lens,
         splats,

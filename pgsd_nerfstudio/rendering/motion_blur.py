@@ -1,4 +1,4 @@
-"""How opacities follow the size of a footprint: motion blur and the blur of a pixel.
+"""How opacities follow the size of a footprint: motion blur, the blur of a pixel, and the smallest alpha that is drawn.
 
 A Gaussian that moves while the shutter is open becomes a longer, fainter Gaussian.
 
@@ -15,6 +15,11 @@ front of it cover it.
 
 What is antialiased keeps its sum of alpha under the blur of a pixel in the same way: its opacity takes the factor
 sqrt(det S0 / det S), S0 its covariance on the image plane without the blur (Yu et al., "Mip-Splatting", 2024, section 4.2).
+
+A rasterizer draws no alpha below a threshold a. Of a Gaussian of peak o and profile g it then draws the ellipse o g >= a, where
+the integral of alpha is 2 pi sqrt(det S) (o - a). What is whole therefore has the peak o + a: its integral is 2 pi sqrt(det S) o
+again, and so is its sum over pixels on average over the places of its centre within a pixel. The fainter it is the smaller is
+the ellipse, and the seldomer it meets the centre of a pixel, where its alpha then is a.
 """
 
 from __future__ import annotations
@@ -37,11 +42,19 @@ def footprint_opacities(
     gaussians: Gaussians,
     to_image: Float[Tensor, "n 2 3"],  # as of `perspective_jacobians`, from the axes of the means
     blur: float,  # pixels squared
+    threshold: float,  # smallest alpha that is drawn
 ) -> Float[Tensor, " n"]:
-    """Opacities on the image plane: averaged over the exposure of what moves, and under the blur of what is antialiased."""
+    """Opacities on the image plane: averaged over the exposure of what moves, under the blur of what is antialiased, and with
+    the threshold on top for what is whole."""
     opacities = gaussians.opacities
-    if gaussians.displacements is None and not gaussians.antialiased:
-        return opacities
+    if gaussians.displacements is not None or gaussians.antialiased:
+        opacities = _of_footprint(gaussians, to_image, blur)
+    return torch.where(opacities > 0, opacities + threshold, opacities) if gaussians.whole else opacities
+
+
+def _of_footprint(gaussians: Gaussians, to_image: Float[Tensor, "n 2 3"], blur: float) -> Float[Tensor, " n"]:
+    """Opacities averaged over the exposure of what moves, and under the blur of what is antialiased."""
+    opacities = gaussians.opacities
     sharp = to_image @ covariances(gaussians) @ to_image.mT
     blurred = sharp + blur * torch.eye(2).to(sharp)
     if gaussians.antialiased:

@@ -11,7 +11,8 @@ projection itself runs in double precision: it is a small part of the time, and 
 A Gaussian that moves by d while the shutter is open is smeared: a uniform distribution of length |d| has the variance
 |d|^2 / 12, so the motion enters the footprint like a fourth axis of that variance. The smeared footprint is larger and its peak
 lower by sqrt(det / det'), so that it takes as much light as the moving Gaussian does on average over the exposure. In the same
-way the blur of a pixel lowers the peak of an antialiased Gaussian: det is then that of the footprint before the blur.
+way the blur of a pixel lowers the peak of an antialiased Gaussian: det is then that of the footprint before the blur. The peak
+of what is whole rises by min_alpha at the end (see motion_blur.py, which has the formulas).
 """
 
 from __future__ import annotations
@@ -185,13 +186,13 @@ def _half_sides(a, b, c, cutoff, lens):
 
 
 @kernel(forceinline=True)
-def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, viewmat, lens, splats):
+def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, missed, viewmat, lens, splats):
     """Write the geometry of splat i."""
     splats[i, LEFT] = 0.0
     splats[i, RIGHT] = 0.0
     x, y, z = to_camera(viewmat, means, i)
     splats[i, DEPTH] = z
-    if not (lens.near <= z <= lens.far) or opacity < lens.min_alpha:
+    if not (lens.near <= z <= lens.far) or not opacity > 0.0 or opacity + missed < lens.min_alpha:
         return
     slope_x, slope_y = x / z, y / z
     bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
@@ -216,6 +217,9 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, 
     if antialiased or moves:
         dimming = math.sqrt(max(still, 0.0) / grown)
         opacity = opacity * dimming
+    if not opacity > 0.0:
+        return
+    opacity += missed
     spread = a - b * b / c
     if not spread > 0.0 or opacity < lens.min_alpha:
         return
@@ -242,17 +246,19 @@ def project(
     opacities: np.ndarray,  # [n] float32
     motions: np.ndarray,  # [n, 3] float32, or [0, 3] where nothing moves
     antialiased: bool,
+    whole: bool,
     viewmat: np.ndarray,  # [4, 4] float64
     lens: Lens,
     splats: np.ndarray,  # [n, 16] float32, written
 ) -> None:
     """Write the geometry of all splats and leave their colours as they are."""
-    share_out(_project, workers(), means, quats, scales, opacities, motions, antialiased, viewmat, lens, splats)
+    missed = lens.min_alpha if whole else 0.0
+    share_out(_project, workers(), means, quats, scales, opacities, motions, antialiased, missed, viewmat, lens, splats)
 
 
 @kernel()
-def _project(worker, workers, means, quats, scales, opacities, motions, antialiased, viewmat, lens, splats):
+def _project(worker, workers, means, quats, scales, opacities, motions, antialiased, missed, viewmat, lens, splats):
     n, moves = means.shape[0], motions.shape[0] > 0
     for i in range(n * worker // workers, n * (worker + 1) // workers):
         opacity = np.float64(opacities[i])
-        _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, viewmat, lens, splats)
+        _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, missed, viewmat, lens, splats)

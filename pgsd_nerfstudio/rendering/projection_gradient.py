@@ -77,6 +77,7 @@ def _project_one_backward(
     motions,
     moves,
     antialiased,
+    missed,
     viewmat,
     lens,
     m,
@@ -113,7 +114,7 @@ def _project_one_backward(
     stretch_x, stretch_y = lens.focal_x / z, lens.focal_y / z
     if moves or antialiased:
         # The opacity was multiplied by sqrt(still / smeared); these are log-derivatives of the two determinants.
-        half = 0.5 * gradients[m, OPACITY] * splats[m, OPACITY]
+        half = 0.5 * gradients[m, OPACITY] * (splats[m, OPACITY] - missed)
         if antialiased:
             a0, c0 = a0 - lens.blur, c0 - lens.blur
         still, smeared = half / (a0 * c0 - b0 * b0), half / (a * c - b * b)
@@ -161,6 +162,7 @@ def project_backward(
     scales: np.ndarray,  # [n, 3] float32
     motions: np.ndarray,  # [n, 3] or [0, 3] float32
     antialiased: bool,
+    whole: bool,
     viewmat: np.ndarray,  # [4, 4] float64
     lens: Lens,
     ids: np.ndarray,  # [m] int32: the Gaussian of each splat
@@ -169,7 +171,8 @@ def project_backward(
     *found: np.ndarray,  # float32, of means, quats, scales, opacities, colours, motions; rows not in `ids` stay as they are
 ) -> None:
     """Write the gradients of the Gaussians from those of their splats."""
-    scene = means, quats, scales, motions, antialiased, viewmat, lens
+    missed = lens.min_alpha if whole else 0.0
+    scene = means, quats, scales, motions, antialiased, missed, viewmat, lens
     share_out(_project_backward, workers(), *scene, ids, splats, gradients, *found)
 
 
@@ -182,6 +185,7 @@ def _project_backward(
     scales,
     motions,
     antialiased,
+    missed,
     viewmat,
     lens,
     ids,
@@ -208,6 +212,7 @@ def _project_backward(
             motions,
             moves,
             antialiased,
+            missed,
             viewmat,
             lens,
             m,

@@ -34,13 +34,20 @@ class Projection(NamedTuple):
     depths: Float[Tensor, " n"]
     """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased."""
+    """Averaged over the exposure if the Gaussian moves, under the blur if it is antialiased, and with `min_alpha` on top if it is
+    whole."""
     radii: Float[Tensor, "n 2"]
     """Half sides of the footprint along x and y in whole pixels, 0 if the Gaussian is not drawn."""
 
 
 def project_reference(
-    gaussians: Gaussians, viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], width: int, height: int, config: RasterConfig
+    gaussians: Gaussians,
+    viewmat: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+    config: RasterConfig,
+    missed: float | None = None,
 ) -> Projection:
     """Project Gaussians by EWA splatting.
 
@@ -51,6 +58,7 @@ def project_reference(
         width: of the image in pixels.
         height: of the image in pixels.
         config: the rules of projection.
+        missed: what the peaks of whole Gaussians rise by; None: `config.min_alpha`.
     """
     points = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = (points[:, 2] >= config.near) & (points[:, 2] <= config.far)
@@ -60,7 +68,7 @@ def project_reference(
     to_image = perspective_jacobians(points, K, width, height, config.frustum_margin) @ viewmat[:3, :3]
     unit = torch.eye(2).to(K)
     flat = to_image @ stretched_covariances(gaussians) @ to_image.mT + config.blur * unit
-    opacities = footprint_opacities(gaussians, to_image, config.blur)
+    opacities = footprint_opacities(gaussians, to_image, config.blur, config.min_alpha if missed is None else missed)
     drawn = seen & (determinants(flat) > 0)
     radii = _half_sides(flat, opacities, config)
     inside = ((centers + radii > 0) & (centers - radii < torch.tensor([width, height]).to(K))).all(dim=-1)
@@ -149,22 +157,33 @@ def certain_pixels(
         config: conventions of the picture.
     """
     config = config or RasterConfig()
-    before = render_reference(cameras, gaussians, config=config).accumulation
+    sets = [one.to(torch.float64) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
+
+    def accumulation(moved: RasterConfig) -> Tensor:
+        clip = [_render_frame(cameras, k, sets, moved, None, config.min_alpha) for k in range(len(cameras))]
+        return torch.stack(clip)[..., 4]
+
+    before = accumulation(config)
     certain = torch.ones_like(before, dtype=torch.bool)
     for factor in (1.0 - margin, 1.0 + margin):
         moved = replace(config, min_alpha=config.min_alpha * factor, min_transmittance=config.min_transmittance * factor)
-        certain &= (render_reference(cameras, gaussians, config=moved).accumulation - before).abs() < 1e-9
+        certain &= (accumulation(moved) - before).abs() < 1e-9
     return certain
 
 
 def _render_frame(
-    cameras: Cameras, k: int, sets: Sequence[Gaussians], config: RasterConfig, moment: Moment | None
+    cameras: Cameras,
+    k: int,
+    sets: Sequence[Gaussians],
+    config: RasterConfig,
+    moment: Moment | None,
+    missed: float | None = None,  # as for `project_reference`
 ) -> Float[Tensor, "h w 5"]:
     view = Viewpoint.of(cameras, k, sets[0].means)
     viewmat, K = view.viewmat, view.K
     if moment is not None:
         sets = [moment.altered(sets[0]), *sets[1:]]
-    parts = [project_reference(one, viewmat, K, cameras.width, cameras.height, config) for one in sets]
+    parts = [project_reference(one, viewmat, K, cameras.width, cameras.height, config, missed) for one in sets]
     projection = Projection(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
     seen = [view_colors(one.colors, one.means, viewmat) for one in sets]
     if moment is not None:

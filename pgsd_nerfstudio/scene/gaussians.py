@@ -35,6 +35,9 @@ class Gaussians:
     antialiased: bool = field(default=False, kw_only=True)
     """Whether opacities are those before the blur of a pixel: the blur then takes from a Gaussian's peak what it adds to its
     area (Yu et al., "Mip-Splatting", 2024; gsplat's rasterize_mode "antialiased"). False: the blur leaves them as they are."""
+    whole: bool = field(default=False, kw_only=True)
+    """Whether a peak rises by the smallest alpha that a rasterizer draws, so that no light is lost to this threshold, however
+    faint a Gaussian is. False: as trained scenes are drawn, which have learned to do without that light."""
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -97,13 +100,15 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     """Join several sets of the same kind of colour (all RGB, or all of one SH degree) in their order.
 
     Raises:
-        ValueError: some of them are antialiased and others are not.
+        ValueError: some of them are antialiased or whole and others are not.
     """
-    antialiased = {part.antialiased for part in parts}
-    if len(antialiased) > 1:
-        raise ValueError("Gaussians that are antialiased and such that are not cannot be joined to one set")
-    joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians) if f.name != "antialiased"}
+    drawn = {(part.antialiased, part.whole) for part in parts}
+    if len(drawn) > 1:
+        raise ValueError("Gaussians that are antialiased (or whole) and such that are not cannot be joined to one set")
+    antialiased, whole = drawn.pop() if drawn else (False, False)
+    flags = "antialiased", "whole"
+    joined = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Gaussians) if f.name not in flags}
     still = [moved is None for moved in joined["displacements"]]
     joined["displacements"] = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]
     tensors: dict[str, Any] = {n: torch.cat(t) for n, t in joined.items() if n != "displacements" or not all(still)}
-    return Gaussians(**tensors, antialiased=antialiased == {True})
+    return Gaussians(**tensors, antialiased=antialiased, whole=whole)

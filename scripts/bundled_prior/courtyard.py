@@ -108,6 +108,8 @@ def simulated(history: ParticleHistory, look: InitialLook, frame: int) -> Gaussi
         torch.cat([active.scales, landed.scales]),
         torch.cat([active.opacity, landed.opacity]),
         torch.cat([active.rgb, landed.rgb]),
+        antialiased=True,
+        whole=True,
     )
 
 
