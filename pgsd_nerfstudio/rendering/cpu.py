@@ -148,6 +148,6 @@ def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tens
     motions, totals = motions_array(gaussians), to_splats[0] if len(to_splats) == 1 else to_splats.sum(axis=0)
     found = [np.zeros(tuple(tensor.shape), np.float32) for tensor in gaussians.tensors.values()]
     outputs = found if len(motions) else [*found, np.zeros((0, 3), np.float32)]
-    projected = means, quats, scales, motions, *drawn, view.viewmat, lens
+    projected = means, quats, scales, motions, drawn.antialiased, drawn.whole, view.viewmat, lens
     project_backward(*projected, ids, dynamic.splats, totals, *outputs)
     return [torch.from_numpy(gradient) for gradient in found]

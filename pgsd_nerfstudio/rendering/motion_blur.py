@@ -17,7 +17,7 @@ What is antialiased keeps its sum of alpha under the blur of a pixel in the same
 sqrt(det S0 / det S), S0 its covariance on the image plane without the blur (Yu et al., "Mip-Splatting", 2024, section 4.2).
 
 A rasterizer draws no alpha below a threshold a. Of a Gaussian of peak o and profile g it then draws the ellipse o g >= a, where
-the integral of alpha is 2 pi sqrt(det S) (o - a). What is whole therefore has the peak o + a: its integral is 2 pi sqrt(det S) o
+the integral of alpha is 2 pi sqrt(det S) (o - a). What is whole therefore has the peak o + a: its integral is that of all of it
 again, and so is its sum over pixels on average over the places of its centre within a pixel. The fainter it is the smaller is
 the ellipse, and the seldomer it meets the centre of a pixel, where its alpha then is a.
 """
