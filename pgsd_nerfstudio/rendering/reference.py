@@ -34,7 +34,7 @@ class Projection(NamedTuple):
     depths: Float[Tensor, " n"]
     """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased; `min_alpha` higher if whole."""
+    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased; `min_alpha` more if whole."""
     radii: Float[Tensor, "n 2"]
     """Half sides of the footprint along x and y in whole pixels, 0 if the Gaussian is not drawn."""
 
