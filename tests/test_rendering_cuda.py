@@ -105,7 +105,7 @@ def leaf_of(gaussians: Gaussians, dtype: torch.dtype, device: str) -> Gaussians:
 
 def assert_same_picture_and_gradients(rasterizer: GsplatRasterizer, frozen: Gaussians, dynamic: Gaussians, device: str):
     cameras = random_cameras(2, 40, 36)
-    certain = certain_pixels(cameras, [frozen, dynamic])
+    certain = certain_pixels(cameras, [frozen, dynamic], config=rasterizer.config)
     assert certain.float().mean() > 0.98
     clips, gradients = [], []
     for judged in (True, False):
@@ -114,7 +114,7 @@ def assert_same_picture_and_gradients(rasterizer: GsplatRasterizer, frozen: Gaus
         if judged:
             clip = rasterizer.render(cameras.to(device), leaf, background)
         else:
-            clip = render_reference(cameras, [frozen, leaf], background)
+            clip = render_reference(cameras, [frozen, leaf], background, rasterizer.config)
         mask = certain.to(clip.rgb.device)
         (clip.rgb[mask].square().sum() + clip.depth[mask].sum() + clip.accumulation[mask].sum()).backward()
         clips.append([image.detach().cpu() for image in clip])

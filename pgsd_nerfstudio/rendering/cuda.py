@@ -70,7 +70,9 @@ class GsplatRasterizer:
         self._check_device(frozen)
         # gsplat has no function that tells which numbers it was compiled with.
         compiled_in = RasterConfig.of_gsplat(gsplat.__version__)
-        self.config = config or compiled_in
+        # Its one threshold of alpha holds for all Gaussians.
+        compiled_in = replace(compiled_in, faint_alpha=compiled_in.min_alpha)
+        self.config = replace(config or compiled_in, faint_alpha=compiled_in.min_alpha)
         if self.config != replace(compiled_in, blur=self.config.blur, near=self.config.near, far=self.config.far):
             raise ValueError(
                 f"gsplat {gsplat.__version__} lets only blur, near and far be chosen, the rest is {compiled_in}; "
@@ -174,7 +176,7 @@ class GsplatRasterizer:
         turn = view.viewmat[:3, :3]
         points = gaussians.means @ turn.T + view.viewmat[:3, 3]
         to_image = perspective_jacobians(points, view.K, view.width, view.height, self.config.frustum_margin) @ turn
-        return footprint_opacities(gaussians, to_image, self.config.blur, self.config.min_alpha)
+        return footprint_opacities(gaussians, to_image, self.config.blur, self.config.faint_alpha)
 
 
 def upper_triangle(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 6"]:

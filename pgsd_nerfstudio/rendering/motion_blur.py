@@ -42,7 +42,7 @@ def footprint_opacities(
     gaussians: Gaussians,
     to_image: Float[Tensor, "n 2 3"],  # as of `perspective_jacobians`, from the axes of the means
     blur: float,  # pixels squared
-    threshold: float,  # smallest alpha that is drawn
+    threshold: float,  # smallest alpha that is drawn of what is whole
 ) -> Float[Tensor, " n"]:
     """Opacities on the image plane: averaged over the exposure of what moves, under the blur of what is antialiased, and with
     the threshold on top for what is whole."""

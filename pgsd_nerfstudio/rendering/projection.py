@@ -12,7 +12,7 @@ A Gaussian that moves by d while the shutter is open is smeared: a uniform distr
 |d|^2 / 12, so the motion enters the footprint like a fourth axis of that variance. The smeared footprint is larger and its peak
 lower by sqrt(det / det'), so that it takes as much light as the moving Gaussian does on average over the exposure. In the same
 way the blur of a pixel lowers the peak of an antialiased Gaussian: det is then that of the footprint before the blur. The peak
-of what is whole rises by min_alpha at the end (see motion_blur.py, which has the formulas).
+of what is whole rises by faint_alpha at the end (see motion_blur.py, which has the formulas).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PRECISION, SHEAR, DROP = 2, 3, 4  # P, S, Q of the exponent
 OPACITY = 5
 RED, GREEN, BLUE = 6, 7, 8
 DEPTH = 9  # along the camera's z axis, scene units
-CUTOFF = 10  # largest sigma at which alpha reaches min_alpha
+CUTOFF = 10  # largest sigma at which alpha reaches min_alpha or faint_alpha
 LEFT, RIGHT, TOP, BOTTOM = 11, 12, 13, 14  # pixels that may be touched, end exclusive; LEFT = RIGHT if there are none
 DIMMING = 15  # factor of the opacity for the motion, and for the blur of what is antialiased
 COLUMNS = 16
@@ -60,6 +60,7 @@ class Lens(NamedTuple):
     square: bool
     radius_sigmas: float
     min_alpha: float
+    faint_alpha: float
 
 
 def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
@@ -90,6 +91,7 @@ def lens(K: np.ndarray, width: int, height: int, config: RasterConfig) -> Lens:
         square=config.footprint == "square",
         radius_sigmas=float(config.radius_sigmas),
         min_alpha=float(config.min_alpha),
+        faint_alpha=float(config.faint_alpha),
     )
 
 
@@ -186,13 +188,14 @@ def _half_sides(a, b, c, cutoff, lens):
 
 
 @kernel(forceinline=True)
-def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, missed, viewmat, lens, splats):
+def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, whole, viewmat, lens, splats):
     """Write the geometry of splat i."""
+    threshold = lens.faint_alpha if whole else lens.min_alpha
     splats[i, LEFT] = 0.0
     splats[i, RIGHT] = 0.0
     x, y, z = to_camera(viewmat, means, i)
     splats[i, DEPTH] = z
-    if not (lens.near <= z <= lens.far) or not opacity > 0.0 or opacity + missed < lens.min_alpha:
+    if not (lens.near <= z <= lens.far) or not opacity > 0.0 or (opacity < threshold and not whole):
         return
     slope_x, slope_y = x / z, y / z
     bend_x, bend_y = min(lens.right, max(lens.left, slope_x)), min(lens.bottom, max(lens.top, slope_y))
@@ -219,11 +222,12 @@ def _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, 
         opacity = opacity * dimming
     if not opacity > 0.0:
         return
-    opacity += missed
+    if whole:
+        opacity += threshold
     spread = a - b * b / c
-    if not spread > 0.0 or opacity < lens.min_alpha:
+    if not spread > 0.0 or opacity < threshold:
         return
-    cutoff = math.log(opacity / lens.min_alpha)
+    cutoff = math.log(opacity / threshold)
     half_width, half_height = _half_sides(a, b, c, cutoff, lens)
     reach_x, reach_y = math.sqrt(2.0 * cutoff * a) + 1e-3, math.sqrt(2.0 * cutoff * c) + 1e-3
     tile_left, tile_right = _tiles(px - half_width, px + half_width, lens.width)
@@ -252,13 +256,12 @@ def project(
     splats: np.ndarray,  # [n, 16] float32, written
 ) -> None:
     """Write the geometry of all splats and leave their colours as they are."""
-    missed = lens.min_alpha if whole else 0.0
-    share_out(_project, workers(), means, quats, scales, opacities, motions, antialiased, missed, viewmat, lens, splats)
+    share_out(_project, workers(), means, quats, scales, opacities, motions, antialiased, whole, viewmat, lens, splats)
 
 
 @kernel()
-def _project(worker, workers, means, quats, scales, opacities, motions, antialiased, missed, viewmat, lens, splats):
+def _project(worker, workers, means, quats, scales, opacities, motions, antialiased, whole, viewmat, lens, splats):
     n, moves = means.shape[0], motions.shape[0] > 0
     for i in range(n * worker // workers, n * (worker + 1) // workers):
         opacity = np.float64(opacities[i])
-        _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, missed, viewmat, lens, splats)
+        _project_one(i, means, quats, scales, opacity, motions, moves, antialiased, whole, viewmat, lens, splats)

@@ -171,7 +171,7 @@ def project_backward(
     *found: np.ndarray,  # float32, of means, quats, scales, opacities, colours, motions; rows not in `ids` stay as they are
 ) -> None:
     """Write the gradients of the Gaussians from those of their splats."""
-    missed = lens.min_alpha if whole else 0.0
+    missed = lens.faint_alpha if whole else 0.0
     scene = means, quats, scales, motions, antialiased, missed, viewmat, lens
     share_out(_project_backward, workers(), *scene, ids, splats, gradients, *found)
 

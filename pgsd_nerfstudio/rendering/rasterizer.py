@@ -45,6 +45,9 @@ class RasterConfig:
     """The projection is linearised no further outside the image than this fraction of its half extent; else it diverges."""
     min_alpha: float = 1.0 / 255.0
     """Smaller contributions are skipped. The default is one step of an 8 bit image, which skips most pixels of a tail."""
+    faint_alpha: float = 1e-2 / 255.0
+    """The same for Gaussians that are whole: each keeps its light, and this is by how much their alphas are noisy. gsplat knows
+    only `min_alpha`, so GsplatRasterizer takes that."""
     max_alpha: float = 0.999
     """Largest alpha of a single Gaussian; none is fully opaque, so that those behind it keep a gradient."""
     min_transmittance: float = 1e-4

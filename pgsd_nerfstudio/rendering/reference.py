@@ -34,7 +34,9 @@ class Projection(NamedTuple):
     depths: Float[Tensor, " n"]
     """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased; `min_alpha` more if whole."""
+    """Averaged over the exposure if the Gaussian moves, and under the blur if it is antialiased; `faint_alpha` more if whole."""
+    thresholds: Float[Tensor, " n"]
+    """Smallest alphas that are drawn."""
     radii: Float[Tensor, "n 2"]
     """Half sides of the footprint along x and y in whole pixels, 0 if the Gaussian is not drawn."""
 
@@ -57,7 +59,7 @@ def project_reference(
         width: of the image in pixels.
         height: of the image in pixels.
         config: the rules of projection.
-        missed: what the peaks of whole Gaussians rise by; None: `config.min_alpha`.
+        missed: what the peaks of whole Gaussians rise by; None: `config.faint_alpha`.
     """
     points = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
     seen = (points[:, 2] >= config.near) & (points[:, 2] <= config.far)
@@ -67,16 +69,18 @@ def project_reference(
     to_image = perspective_jacobians(points, K, width, height, config.frustum_margin) @ viewmat[:3, :3]
     unit = torch.eye(2).to(K)
     flat = to_image @ stretched_covariances(gaussians) @ to_image.mT + config.blur * unit
-    opacities = footprint_opacities(gaussians, to_image, config.blur, config.min_alpha if missed is None else missed)
+    opacities = footprint_opacities(gaussians, to_image, config.blur, config.faint_alpha if missed is None else missed)
     drawn = seen & (determinants(flat) > 0)
-    radii = _half_sides(flat, opacities, config)
+    thresholds = torch.full_like(opacities, config.faint_alpha if gaussians.whole else config.min_alpha)
+    radii = _half_sides(flat, opacities, thresholds, config)
     inside = ((centers + radii > 0) & (centers - radii < torch.tensor([width, height]).to(K))).all(dim=-1)
-    return Projection(centers, flat, points[:, 2], opacities, torch.where((drawn & inside)[:, None], radii, 0.0))
+    radii = torch.where((drawn & inside)[:, None], radii, 0.0)
+    return Projection(centers, flat, points[:, 2], opacities, thresholds, radii)
 
 
 @torch.no_grad()
 def _half_sides(
-    covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"], config: RasterConfig
+    covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"], thresholds: Float[Tensor, " n"], config: RasterConfig
 ) -> Float[Tensor, "n 2"]:
     """Half sides of the footprint in whole pixels."""
     variances = covariances.diagonal(dim1=1, dim2=2)
@@ -84,7 +88,7 @@ def _half_sides(
         mean = variances.mean(dim=1, keepdim=True)
         largest = mean + (mean**2 - determinants(covariances)[:, None]).clamp_min(0.01).sqrt()
         return (config.radius_sigmas * largest.sqrt()).ceil().expand(-1, 2)
-    sigmas = (2.0 * (opacities / config.min_alpha).clamp_min(1.0).log()).sqrt().clamp_max(config.radius_sigmas)
+    sigmas = (2.0 * (opacities / thresholds).clamp_min(1.0).log()).sqrt().clamp_max(config.radius_sigmas)
     return (sigmas[:, None] * variances.sqrt()).ceil()
 
 
@@ -104,7 +108,7 @@ def _blend(
     a, b, c = projection.covariances.flatten(1)[:, [0, 1, 3]].unbind(-1)
     sigma = (0.5 * (c * dx**2 + a * dy**2) - b * dx * dy) / determinants(projection.covariances)
     alpha = (projection.opacities * torch.exp(-sigma)).clamp_max(config.max_alpha)
-    alpha = torch.where(alpha >= config.min_alpha, alpha, 0.0)
+    alpha = torch.where(alpha >= projection.thresholds, alpha, 0.0)
     after = torch.cumprod(1.0 - alpha, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     # Light only decreases along the ray, so the first Gaussian that lets too little through cuts off all behind it too.
@@ -159,13 +163,18 @@ def certain_pixels(
     sets = [one.to(torch.float64) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
 
     def accumulation(moved: RasterConfig) -> Tensor:
-        clip = [_render_frame(cameras, k, sets, moved, None, config.min_alpha) for k in range(len(cameras))]
+        clip = [_render_frame(cameras, k, sets, moved, None, config.faint_alpha) for k in range(len(cameras))]
         return torch.stack(clip)[..., 4]
 
     before = accumulation(config)
     certain = torch.ones_like(before, dtype=torch.bool)
     for factor in (1.0 - margin, 1.0 + margin):
-        moved = replace(config, min_alpha=config.min_alpha * factor, min_transmittance=config.min_transmittance * factor)
+        moved = replace(
+            config,
+            min_alpha=config.min_alpha * factor,
+            faint_alpha=config.faint_alpha * factor,
+            min_transmittance=config.min_transmittance * factor,
+        )
         certain &= (accumulation(moved) - before).abs() < 1e-9
     return certain
 
