@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -10,7 +11,9 @@ from torch import Tensor
 
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows.rasterizer import bench, leaves, psnr
+from pgsd_nerfstudio.laboratory.yard import view_into_yard, yard_flakes
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.rendering.motion_blur import determinants
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig, Rendering
 from pgsd_nerfstudio.rendering.reference import certain_pixels, project_reference, render_reference
 from pgsd_nerfstudio.rendering.trial import random_cameras, random_gaussians, relative_error
@@ -19,6 +22,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 _JUDGE = "float64 torch reference, pixels whose decisions do not hang on single precision"
+_SIZES = ((96, 64), (192, 128), (384, 256), (960, 640))
 _NAMES = ["means", "quats", "scales", "opacities", "colors"]
 
 __all__ = ["bench", "verify"]
@@ -30,6 +34,7 @@ def verify(quick: bool) -> list[Record]:
     return [
         *_against_the_reference(seeds),
         _merged_exactly(seeds),
+        *_coverage(quick),
         *_against_gsplat_formulas(),
         _against_gsplat_on_cuda(),
         _names_what_is_not_finite(),
@@ -66,6 +71,51 @@ def _merged_exactly(seeds: range) -> Record:
     return Record.judged(
         "frozen and dynamic merged against one set", worst, "", "<= 0", source="the prepared frozen scene saves time, not bits"
     )
+
+
+def _coverage(quick: bool) -> Iterator[Record]:
+    """Share of a picture that flying particles cover, at four sizes of the same picture, against the sum of their areas.
+
+    The optical depth of a pixel is on average the sum of all areas 2 pi opacity sqrt(det S) over that of the picture, S the
+    covariance on the image plane without the blur of a pixel.
+    """
+    flakes = yard_flakes(100_000 if quick else 400_000)
+    sharp, moves = 0.3 * flakes.scales, torch.tensor([0.02, 0.0, -0.03]).expand(len(flakes), 3)
+    still = replace(flakes, scales=sharp, antialiased=True, whole=True)
+    gsplat = RasterConfig(faint_alpha=RasterConfig().min_alpha)
+    cases = {
+        "flakes": (still, RasterConfig()),
+        "streaks": (replace(still, displacements=moves), RasterConfig()),
+        "flakes, the threshold of gsplat": (still, gsplat),
+        "flakes, classic": (replace(still, antialiased=False, whole=False), RasterConfig()),
+    }
+    for name, (one, config) in cases.items():
+        found, expected = zip(*(_covered(one, size, config) for size in _SIZES), strict=True)
+        worst = 100 * max(abs(a / b - 1) for a, b in zip(found, expected, strict=True))
+        shares = ", ".join(f"{100 * share:.2f} % at {w}x{h}" for share, (w, h) in zip(found, _SIZES, strict=True))
+        source = f"{shares}; the sum of the areas is {100 * expected[-1]:.2f} %"
+        if one.whole:
+            yield Record.judged(f"coverage at 96x64 to 960x640, {name}", worst, "% off, worst", "<= 15", source=source)
+        else:
+            yield Record(f"coverage at 96x64 to 960x640, {name}", worst, "% off, worst", source=source)
+
+
+def _covered(flakes: Gaussians, size: tuple[int, int], config: RasterConfig) -> tuple[float, float]:
+    """Mean alpha of a picture without its outer tenth, and what Beer-Lambert says of the areas there."""
+    cameras = view_into_yard(*size)
+    width, height = size
+    alpha = CpuRasterizer(Gaussians.empty(), config=config).render(cameras, flakes).accumulation[0]
+    exact, view = flakes.to(torch.float64), cameras.viewmats[0].double()
+    fine = replace(config, blur=1e-12)
+    areas = project_reference(replace(exact, displacements=None, whole=False), view, cameras.Ks[0].double(), *size, fine)
+    x, y = areas.centers.unbind(1)
+    low = torch.tensor([0.1 * width, 0.1 * height])
+    inside = (x > low[0]) & (x < width - low[0]) & (y > low[1]) & (y < height - low[1])
+    inside &= (exact.means @ view[:3, :3].T + view[:3, 3])[:, 2] >= config.near
+    shadows = 2 * math.pi * exact.opacities * determinants(areas.covariances).clamp_min(0).sqrt()
+    depth = shadows[inside].sum() / (0.64 * width * height)
+    rows, columns = round(0.1 * height), round(0.1 * width)
+    return float(alpha[rows : height - rows, columns : width - columns].mean()), float(1 - torch.exp(-depth))
 
 
 def _against_gsplat_formulas() -> list[Record]:
