@@ -34,7 +34,7 @@ class Projection(NamedTuple):
     depths: Float[Tensor, " n"]
     """Along the camera's z axis, scene units."""
     opacities: Float[Tensor, " n"]
-    """Averaged over the exposure if it moves, and under the blur if the Gaussian is antialiased; `faint_alpha` more if it is whole."""
+    """Averaged over the exposure if it moves, and under the blur if it is antialiased; `faint_alpha` more if it is whole."""
     thresholds: Float[Tensor, " n"]
     """Smallest alphas that are drawn."""
     radii: Float[Tensor, "n 2"]
