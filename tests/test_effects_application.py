@@ -26,6 +26,7 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.effects.vocabulary import KINDS
 from pgsd_nerfstudio.physics import Clock, Domain, simulate_metric
 from pgsd_nerfstudio.physics.air.emitters import Sizes
+from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.laws import fall_speeds
 from pgsd_nerfstudio.physics.laws.populations import extinction, fall_speed, integral, number_density
@@ -34,6 +35,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 from pgsd_nerfstudio.weather.options import SceneOptions
 
 PROMPT = "Purple things are falling in {scene}"
+BOX = Domain((-10.0, -10.0, 0.0), (10.0, 10.0, 7.5))
 PURPLE = (0.5, 0.0, 0.5)
 
 
@@ -201,12 +203,12 @@ def test_amounts_stop_where_an_emission_refuses_and_say_so(base):
 def test_no_parcel_of_fog_has_to_be_darker_than_opaque():
     for amount, size in product((0.1, 1.0, 5.0), (0.2, 1.0, 5.0)):
         effect = applied(request("fog", amount=amount, size=size))
-        sizes = Sizes.of(effect, 3000.0, effect.emission.most or 0)
-        count = sizes.in_air[-1] * 3000.0
+        sizes = Sizes.of(effect, BOX, effect.emission.most or 0, Sight.everything())
+        count = sizes.in_air()[-1] * BOX.volume
         assert count == pytest.approx(effect.emission.most, rel=0.01)
         # Optical depth in the middle of a parcel, by its part of the extinction that parcels cause and the area it covers.
         a, b, c = effect.appearance.active.scale_m or (0, 0, 0)
-        depth = effect.emission.share * extinction(effect.emission) * 3000.0 / count / (2 * np.pi * (a * b * c) ** (2 / 3))
+        depth = effect.emission.share * extinction(effect.emission) * BOX.volume / count / (2 * np.pi * (a * b * c) ** (2 / 3))
         assert depth < 0.6
 
 
@@ -290,8 +292,8 @@ def test_the_ends_of_each_range_give_looks_that_can_be_drawn(base):
             assert 0 <= state.rgb.min() <= state.rgb.max() <= 1
             assert 0 < state.scales.min() <= state.scales.max() < 15
         assert found.active.rgb[:, 1].max() == 0  # no green in purple
-        sizes = Sizes.of(effect, 3000.0, 20_000)
-        assert np.isfinite(sizes.in_air).all() and sizes.in_air[-1] > 0
+        sizes = Sizes.of(effect, BOX, 20_000, Sight.everything())
+        assert np.isfinite(sizes.in_air()).all() and sizes.in_air()[-1] > 0
 
 
 def test_every_kind_that_the_reader_knows_can_be_applied():

@@ -174,6 +174,7 @@ def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_
         rest_quats=none.reshape(0, 4),
         rest_extents=none,
         rest_covers=none,
+        rest_represents=none,
         state=replace(RunState.empty(), born=count),
     )
     fresh = assemble([chunk], Clock(fps=25.0, frames=frames), {})

@@ -85,7 +85,12 @@ class Appearance:
     """Shutter time in seconds: active particles are smeared by speed times this. 0 freezes them, as is usual for snow; rain and
     sand show streaks at 1/50 s."""
 
+    legibility: float = 1.0
+    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature, which can be next to nothing."""
+
     def __post_init__(self) -> None:
+        if not 1.0 <= self.legibility <= 100.0:
+            raise ValueError(f"legibility must lie in 1-100, got {self.legibility:g}; at 1 particles cover what they cover")
         if not 0.0 <= self.exposure <= 1.0:
             raise ValueError(f"exposure must lie in 0-1 s, got {self.exposure:g}; a film camera has about 0.02")
 

@@ -93,13 +93,11 @@ class RunState:
     """State of cover, wetness and dense matter; see `deposits.Deposits`."""
     born: int
     """Number of particles so far, which is the next id."""
-    carry: float
-    """Fraction of a particle that is due to enter through the top."""
 
     @staticmethod
     def empty() -> RunState:
         """The state before the first frame."""
-        return RunState(Bodies.none(), Bodies.none(), Bodies.none(), {}, 0, 0.0)
+        return RunState(Bodies.none(), Bodies.none(), Bodies.none(), {}, 0)
 
     @property
     def moving(self) -> int:
@@ -113,18 +111,17 @@ class RunState:
         return named | with_prefix("deposits.", self.deposits)
 
     @staticmethod
-    def of(arrays: Mapping[str, ndarray], born: int, carry: float) -> RunState:
+    def of(arrays: Mapping[str, ndarray], born: int) -> RunState:
         """Rebuild a state.
 
         Args:
             arrays: what the method `arrays` returned.
             born: number of particles so far.
-            carry: fraction of a particle that is due to enter through the top.
         """
         flying, sliding, dense = (
             Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in ("flying", "sliding", "dense")
         )
-        return RunState(flying, sliding, dense, without_prefix("deposits.", arrays), born, carry)
+        return RunState(flying, sliding, dense, without_prefix("deposits.", arrays), born)
 
 
 T = TypeVar("T")

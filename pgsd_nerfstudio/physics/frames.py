@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.physics.air.air import Air
 from pgsd_nerfstudio.physics.air.splash import splashed
-from pgsd_nerfstudio.physics.bodies import ABSORBED, DENSE, LEFT, SLID, UNSEEN, Bodies, RunState
+from pgsd_nerfstudio.physics.bodies import ABSORBED, DENSE, LEFT, SLID, SPLASHED, UNSEEN, Bodies, RunState
 from pgsd_nerfstudio.physics.ground.deposits import Deposits
 from pgsd_nerfstudio.physics.ground.landing import Meeting
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
@@ -46,10 +46,10 @@ class _Simulation:
     def __init__(self, air: Air, deposits: Deposits, log: Log, state: RunState) -> None:
         self.air, self.deposits, self.log = air, deposits, log
         self.flying = Bodies.join([state.flying])  # a copy, since `Air.fly` changes arrays in place
-        self.sliding, self.dense, self.carry = state.sliding, state.dense, state.carry
+        self.sliding, self.dense = state.sliding, state.dense
 
     def state(self) -> RunState:
-        return RunState(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born, self.carry)
+        return RunState(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born)
 
     def begin(self) -> None:
         """Frame 0: particles that are in the air from the start enter."""
@@ -62,12 +62,12 @@ class _Simulation:
         air.fly(self.flying, frame)
         contacts = air.ground.meet(before, self.flying.positions, self.deposits.cover)
         self.flying.positions[contacts.which] = contacts.points
-        free, left = self._leave(contacts, frame)
+        free = self._leave(contacts, frame)
         took_off = self._slide(frame)
         self._move_dense(frame)
         in_contact = self.flying.select(contacts.which)
         gliding, droplets = self._resolve_contacts(in_contact, contacts, frame)
-        entering, self.carry = air.entering(left, self.carry, frame)
+        entering = air.entering(frame)
         log.see(free, frame)
         stay = Bodies.join([free, took_off, gliding])
         self.flying = Bodies.join([stay, log.enter(droplets, frame), log.enter(entering, frame)])
@@ -75,10 +75,11 @@ class _Simulation:
         for bodies in (self.flying, self.sliding, self.dense):
             _check(bodies, frame)
 
-    def _leave(self, contacts: Meeting, frame: int) -> tuple[Bodies, Bodies]:
-        """Particles that fly on without a contact, and particles that left the domain.
+    def _leave(self, contacts: Meeting, frame: int) -> Bodies:
+        """Particles that fly on without a contact.
 
-        A particle also ends when no camera can see it any more, and when it flies out ahead of the weather's front.
+        A particle ends when it leaves the domain, when no camera can see it within its reach any more, and when it flies out
+        ahead of the weather's front.
         """
         air, bodies, log = self.air, self.flying, self.log
         lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
@@ -86,12 +87,11 @@ class _Simulation:
         contact = np.zeros(len(bodies), bool)
         contact[contacts.which] = True
         ahead = ~contact & ~out & ~air.arrival.passed(bodies.positions, frame * air.step)
-        unseen = ~(contact | out | ahead) & ~air.sight.needed(bodies.positions)
-        left = bodies.select(out & ~contact)
-        log.end(left, frame, LEFT)
+        unseen = ~(contact | out | ahead) & ~air.sight.needed(bodies.positions, bodies.reaches)
+        log.end(bodies.select(out & ~contact), frame, LEFT)
         log.end(bodies.select(ahead), frame, LEFT)
         log.end(bodies.select(unseen), frame, UNSEEN)
-        return bodies.select(~(contact | out | ahead | unseen)), left
+        return bodies.select(~(contact | out | ahead | unseen))
 
     def _slide(self, frame: int) -> Bodies:
         """Move sliders and land the slow ones; returns the sliders that fly again."""
@@ -146,6 +146,9 @@ class _Simulation:
                 ),
                 Bodies.none(),
             )
+        # Fewer come so far as were born with it: each stands for those that were dropped on the way too.
+        stand_for = np.where(bodies.kinds & SPLASHED, bodies.represents, air.represents(bodies.positions, bodies.diameters))
+        bodies = replace(bodies, represents=stand_for)
         if response.landing in ("wets", "vanishes"):
             droplets, share = Bodies.none(), np.zeros(len(bodies))
             if response.splash is not None:

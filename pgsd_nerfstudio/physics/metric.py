@@ -7,6 +7,7 @@ same bits.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 MAX_PARTICLES = 20_000  # flying at once; a CPU renders and refines that many in reasonable time
 CHUNK = 25  # frames; an interruption loses at most that many
 LEAST_GUSTS = 0.35  # smallest gustiness that the region of sight allows for
+WIDEST_PICTURE = 640  # pixels; in wider pictures even more could be told apart, and hardly anyone would see it
+SMALLEST_SEEN = 0.28  # pixels; a flake so wide takes 2 % of the light of its pixel
 SIGHT_MARGIN = 0.5  # m around views; the cameras of training clips stray no farther from the straight paths between cameras
 
 console = Console(stderr=True, highlight=False)
@@ -87,14 +90,15 @@ def simulate_metric(
     chunks: list[Chunk] = []
     state = RunState.empty()
     with _one_thread(), _bar(progress) as bar:
+        sight, most = _sight(effect, domain, cameras), min(max_particles, effect.emission.most or max_particles)
         air = Air(
             domain=domain,
-            sizes=Sizes.of(effect, domain.volume, min(max_particles, effect.emission.most or max_particles)),
+            sizes=Sizes.of(effect, domain, most, sight, _sharpness(effect, cameras)),
             wind=WindField.draw(effect.wind, seed, Deflection.of(surface, domain, effect.wind)),
             arrival=Arrival.of(effect.timeline, domain, effect.wind),
             effect=effect,
             ground=Ground.of(surface, effect.surface, domain),
-            sight=_sight(effect, domain, cameras),
+            sight=sight,
             step=clock.step,
             seed=seed,
         )
@@ -121,6 +125,8 @@ def simulate_metric(
         "unit": effect.emission.unit,
         "domain": [*domain.lower, *domain.upper],
         "air_simulated": air.sight.share,
+        "real_in_air": air.sizes.real_in_air,
+        "sharpness": air.sizes.sharpness,
         **deposits.summary(),
         "seconds": time.perf_counter() - began,
     }
@@ -137,6 +143,17 @@ def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
     ends = np.array([effect.emission.smallest, effect.emission.largest])
     slowest, fastest = (float(speed) for speed in np.sort(fall_speed(ends, effect.material)))
     return Sight.of(domain, cameras, distance=SIGHT, margin=SIGHT_MARGIN, slowest=slowest, fastest=fastest, wind=wind)
+
+
+def _sharpness(effect: Effect, cameras: Cameras | None) -> float | None:
+    """Distance up to which pictures tell particles apart, relative to their diameter; None where distance does not matter.
+
+    A parcel of fog is no droplet, and is seen at any distance.
+    """
+    if cameras is None or len(cameras) == 0 or effect.emission.kind == "fog droplets":
+        return None
+    focal = float(cameras.Ks[:, 0, 0].median()) * min(1.0, WIDEST_PICTURE / cameras.width)
+    return math.sqrt(effect.appearance.legibility) * focal / SMALLEST_SEEN
 
 
 @contextmanager

@@ -1,5 +1,4 @@
-"""The air of a run and the particles that enter it: at the start or when the weather arrives, then through the top and the
-sides.
+"""The air of a run and the particles that enter it: at the start or when the weather arrives, then through top and sides.
 
 Weather behind a front is steady weather cut off at the front: no particle is ahead of it. In each frame the particles enter
 that the front has passed since the frame before, drawn from steady air. Particles that the wind carries ahead of the front
@@ -9,23 +8,25 @@ slower.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.air.airborne import Flutter, advance, air_velocity
 from pgsd_nerfstudio.physics.air.arrival import Arrival
-from pgsd_nerfstudio.physics.air.emitters import Sizes, feed, fill
-from pgsd_nerfstudio.physics.air.sight import Sight
+from pgsd_nerfstudio.physics.air.emitters import Newcomers, Sizes, fill, outside
+from pgsd_nerfstudio.physics.air.sight import WIDEST_SWAY, Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
-from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, Bodies
+from pgsd_nerfstudio.physics.bodies import Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.landing import Ground
+from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.physics.laws.populations import fall_speed
 
+ROOM = 4.0  # standard deviations of the turbulence for which air around the domain is searched for what enters
 ARRIVING, SHOWN, AHEAD, WALK, WALK_AHEAD = 0xA221, 0x5404, 0xF207, 0xD1FF, 0xD1FA  # purposes of randomness
 
 
@@ -82,15 +83,15 @@ class Air:
         came[:, 2] -= speeds
         return ~self.ground.open_above(positions, -came)
 
-    def newborn(self, positions: ndarray, diameters: ndarray, velocities: ndarray, rng: np.random.Generator) -> Bodies:
+    def newborn(self, found: Newcomers, velocities: ndarray, rng: np.random.Generator) -> Bodies:
         """New particles without ids.
 
         Args:
-            positions: [n, 3] m.
-            diameters: [n] m.
+            found: their places, sizes and reaches.
             velocities: [n, 3] m/s.
             rng: draws flutter, hold and spin.
         """
+        positions, diameters, reaches = found
         count, wind = len(diameters), self.effect.wind
         speeds = fall_speed(diameters, self.effect.material)
         draw = rng.uniform(size=(5, count))
@@ -107,10 +108,19 @@ class Air:
             phases=draw[2].astype(np.float32),
             holds=draw[3].astype(np.float32),
             spins=draw[4].astype(np.float32),
-            represents=self.sizes.represents(diameters).astype(np.float32),
-            reaches=np.full(count, ANY_DISTANCE),
+            represents=self.represents(positions, diameters),
+            reaches=reaches.astype(np.float32),
             kinds=np.zeros(count, np.uint8),
         )
+
+    def represents(self, positions: ndarray, diameters: ndarray) -> Float[ndarray, " n"]:
+        """Real particles that particles represent where they are, float32.
+
+        Args:
+            positions: [n, 3] m.
+            diameters: [n] m.
+        """
+        return self.sizes.represents(diameters, self.sight.distances(positions)).astype(np.float32)
 
     def fly(self, bodies: Bodies, frame: int, purpose: int = WALK) -> None:
         """Move flying particles from the frame before to `frame`.
@@ -133,32 +143,38 @@ class Air:
             return Bodies.none()
         return self._passed_by_front(frame) if self.arrival.is_front else self._reached(frame)
 
-    def entering(self, gone: Bodies, carry: float, frame: int) -> tuple[Bodies, float]:
-        """New particles of a frame: through the top, through the sides, and where the weather arrives.
+    def entering(self, frame: int) -> Bodies:
+        """New particles of a frame, without ids: through the top and the sides, and where the weather arrives.
 
         Args:
-            gone: particles that left the domain; each is replaced by one that enters at the opposite side.
-            carry: fraction of a particle that is due to enter through the top.
             frame: the frame in which they enter.
-
-        Returns:
-            The particles, without ids, and the fraction of a particle to carry over to the next frame.
         """
         if self.arrival.is_over(frame * self.step):
-            return Bodies.none(), carry
+            return Bodies.none()
         rng, time = self.draws(frame), frame * self.step
-        positions, diameters, share, carry = feed(self.sizes, self.domain, carry, self.step, rng)
-        velocities = self.settled(positions, fall_speed(diameters, self.effect.material), time)
-        positions = positions + velocities * (share * self.step)[:, None]
-        self._wrap(positions)
-        # Each particle entered at its own time within the step. The position of a front is that of this frame.
-        entered = time if self.arrival.is_front else time - share * self.step
-        arrived = self.arrival.times(positions, self.draws(frame, SHOWN).uniform(size=len(positions))) <= entered
-        fed = self.newborn(positions, diameters, velocities, rng).select(arrived & self.sight.needed(positions))
-        # During an onset fewer particles leave, so fewer enter at the opposite side: these need no thinning of their own.
-        through_sides = self._wrapped(gone, time)
-        through_sides = replace(through_sides, kinds=np.zeros_like(through_sides.kinds))
-        return Bodies.join([fed, through_sides, self.arriving(frame)]), carry
+        found = outside(self.sizes, self.domain, self.sight, self._margins(time), rng)
+        speeds = fall_speed(found.diameters, self.effect.material)
+        velocities = self.settled(found.positions, speeds, time - 0.5 * self.step)
+        moved = found._replace(positions=found.positions + velocities * self.step)
+        inside = ((moved.positions >= self.domain.lower) & (moved.positions <= self.domain.upper)).all(1)
+        # The position of a front is that of this frame.
+        arrived = self.arrival.times(moved.positions, self.draws(frame, SHOWN).uniform(size=len(inside))) <= time
+        enters = inside & arrived & self.sight.needed(moved.positions, moved.reaches)
+        new = self.newborn(moved.select(enters), velocities[enters], rng)
+        # What comes through the top comes from the sky; through a side it may come from the lee of a wall or from below a roof.
+        beside = found.positions[enters, 2] <= self.domain.upper[2]
+        beside[beside] = self.shadowed(new.positions[beside], new.speeds[beside], time)
+        return Bodies.join([new.select(~beside), self.arriving(frame)])
+
+    def _margins(self, time: float) -> Float[ndarray, "2 3"]:
+        """Metres around the domain from which particles may enter within a step: its lower and its upper sides."""
+        wind = self.effect.wind
+        growth = float(law_of_the_wall(np.array(self.domain.upper[2:]), wind.roughness, wind.reference_height)[0])
+        mean = np.array([*(growth * self.wind.at_reference(time)), 0.0])
+        swirl = ROOM * wind.turbulence + WIDEST_SWAY * wind.flutter
+        inward = np.array([mean + swirl, swirl - mean])
+        inward[1, 2] += float(fall_speed(self.sizes.diameters[[0, -1]], self.effect.material).max())
+        return inward.clip(0.0) * self.step
 
     def _reached(self, frame: int) -> Bodies:
         """The particles of a full domain that the weather, which arrives everywhere, reaches in `frame`.
@@ -167,42 +183,43 @@ class Air:
         anew in each frame, so that an interrupted run needs no stored list of them.
         """
         rng, time = self.draws(0), frame * self.step
-        positions, diameters = fill(self.sizes, self.domain, rng)
-        new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
-        times = self.arrival.times(positions, self.draws(0, ARRIVING).uniform(size=len(positions)))
+        found = fill(self.sizes, self.domain, self.sight, rng)
+        times = self.arrival.times(found.positions, self.draws(0, ARRIVING).uniform(size=len(found.positions)))
         now = np.ceil(times / self.step).clip(1.0 if self.effect.timeline.starts_clear else 0.0) == frame
-        positions, speeds = positions[now], fall_speed(diameters[now], self.effect.material)
-        velocities = self.settled(positions, speeds, time).astype(np.float32)
-        new = replace(new.select(now), velocities=velocities)
-        return new.select(~self.shadowed(positions, speeds, time) & self.sight.needed(positions))
+        now[now] = self.sight.needed(found.positions[now], found.reaches[now])
+        found = found.select(now)
+        speeds = fall_speed(found.diameters, self.effect.material)
+        new = self.newborn(found, self.settled(found.positions, speeds, time), self.draws(frame, ARRIVING))
+        return new.select(~self.shadowed(found.positions, speeds, time))
 
     def _passed_by_front(self, frame: int) -> Bodies:
-        """Particles ahead of the front in the frame before and behind it in `frame`, across the domain's sides too."""
+        """Particles ahead of the front in the frame before and behind it in `frame`."""
         if frame == 0:
             return Bodies.none()
-        rng, before = self.draws(frame, AHEAD), (frame - 1) * self.step
-        positions, diameters = fill(self.sizes, self.domain, rng)
-        ahead = self.arrival.times(positions) > before
-        positions, diameters = positions[ahead], diameters[ahead]
-        new = self.newborn(positions, diameters, np.zeros_like(positions), rng)
+        rng, before, time = self.draws(frame, AHEAD), (frame - 1) * self.step, frame * self.step
+        found = fill(self.sizes, self.domain, self.sight, rng, self._before_front(before))
+        found = found.select(self.arrival.times(found.positions) > before)
+        new = self.newborn(found, np.zeros_like(found.positions), rng)
         # Particles of almost no terminal speed take the air's velocity at once, so the kernel yields settled velocities; it is
         # many times faster than `settled`.
         weightless, none = np.full(len(new), 1e-9, np.float32), Flutter.none(len(new))
         advance(new.positions.copy(), new.velocities, weightless, none, self.wind, before, self.step)
         new.velocities[:, 2] -= new.speeds
         self.fly(new, frame, WALK_AHEAD)
-        return self._wrapped(new, frame * self.step)
+        inside = ((new.positions >= self.domain.lower) & (new.positions <= self.domain.upper)).all(1)
+        inside &= self.sight.needed(new.positions, new.reaches) & self.arrival.passed(new.positions, time)
+        inside[inside] = ~self.shadowed(new.positions[inside], new.speeds[inside], time)
+        return new.select(inside)
 
-    def _wrapped(self, bodies: Bodies, time: float) -> Bodies:
-        """Particles wrapped into the domain, periodic in x and y. Those that cannot be there or are unneeded drop out."""
-        inside = (bodies.positions[:, 2] >= self.domain.lower[2]) & (bodies.positions[:, 2] <= self.domain.upper[2])
-        wrapped = bodies.positions.astype(np.float64)
-        self._wrap(wrapped)
-        inside &= self.sight.needed(wrapped) & self.arrival.passed(wrapped, time)
-        inside[inside] = ~self.shadowed(wrapped[inside], bodies.speeds[inside], time)
-        return replace(bodies.select(inside), positions=wrapped[inside].astype(np.float32))
-
-    def _wrap(self, positions: Float[ndarray, "n 3"]) -> None:
-        """Wrap x and y into the domain, in place."""
-        lower, size = np.asarray(self.domain.lower[:2]), np.asarray(self.domain.size[:2])
-        positions[:, :2] = lower + (positions[:, :2] - lower) % size
+    def _before_front(self, before: float) -> Bool[ndarray, "x y z"] | None:
+        """Cells of the region of sight from which a front may be met within a step; None where there are no cells."""
+        if not self.sight.needed_distances.size:
+            return None
+        columns = np.moveaxis(np.indices(self.sight.needed_distances.shape[:2]), 0, -1) + 0.5
+        flat = (self.sight.lower[:2] + columns * self.sight.cell[:2]).reshape(-1, 2)
+        times = self.arrival.times(np.column_stack([flat, np.zeros(len(flat))])).reshape(columns.shape[:2])
+        # Half a cell, the way of the front, and the way of a particle against it.
+        room = np.hypot(*self.sight.cell[:2]) / 2 + np.abs(self._margins(before)[:, :2]).max() * 2
+        slack = self.effect.timeline.onset * room / self.arrival.spans.sum() + self.step
+        near = (times > before - slack) & (times <= before + self.step + slack)
+        return np.broadcast_to(near[:, :, None], self.sight.needed_distances.shape)

@@ -1,7 +1,9 @@
 """The region of sight: the air where cameras see particles, and the air from which particles may still come into view.
 
-A cell of the domain is seen if any part of it may be in a camera's pyramid of view. A cell is needed if some displacement from
-it to a seen cell is possible. The bounds of the displacement after t seconds are:
+A cell of the domain is seen if any part of it may be in a camera's pyramid of view, from the distance of the nearest camera
+that sees it. A cell is needed if some displacement from it to a seen cell is possible, and its distance is the least of those
+cells: a particle is simulated where it may come within its reach (`reach`) of a camera. The bounds of the displacement after t
+seconds are:
 
 - Down, it is between slowest t - r(t) and fastest t + r(t), from the range of terminal speeds.
 - Along the mean wind, it is between -G(t) - r(t) and full t + G(t) + r(t). The mean wind is anything from 0 (near the ground,
@@ -19,7 +21,7 @@ Inertia adds nothing, since velocities under drag are means of past settled velo
 
 The domain is periodic in x and y: a particle that leaves at one side enters at the opposite side. Possible displacements
 therefore form one pattern on a torus, the same for all cells, and the needed cells are the seen cells convolved with that
-pattern: one Fourier transform.
+pattern: one Fourier transform for the cells within each of a ladder of distances, whose steps are NEARER.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
@@ -39,7 +42,9 @@ from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.scene.cameras import Cameras
 
 CELL = 0.25  # m
-MOST = 500_000  # cells; larger domains get larger cells
+MOST = 150_000  # cells; larger domains get larger cells
+CLOSEST = 0.4  # m; nearer to a camera no more particles are told apart than at this distance
+NEARER = 1.15  # ratio of the distances that are told apart; a needed cell takes the lower one
 DEVIATIONS = 3.0  # standard deviations of gusts and of the turbulent walk
 GUST_RATES = (0.2, 1.25)  # lowest and highest, as `wind` draws them: hertz times `gust_seconds`
 WIDEST_SWAY, SLOWEST_SWAY = 1.7, 0.6  # bounds of the flutter's speed and hertz that `Air.newborn` draws, as factors
@@ -49,19 +54,22 @@ INSTANTS = np.concatenate([[0.0], np.geomspace(1e-3, 1e6, 2048)])  # s; 1% apart
 
 @dataclass(frozen=True)
 class Sight:
-    """Cells of a domain that are seen and needed; there are no cells where all air is seen."""
+    """Cells of a domain, and how near cameras come to them; there are no cells where all air is seen."""
 
     lower: Float[ndarray, "3"]
     """Corner of the first cell, m."""
     cell: Float[ndarray, "3"]
     """Edges of a cell, m."""
-    seen_cells: Bool[ndarray, "x y z"]
-    needed_cells: Bool[ndarray, "x y z"]
+    seen_distances: Float[ndarray, "x y z"]
+    """Distance in metres, float32, of the nearest camera that sees a part of each cell; infinite where none does."""
+    needed_distances: Float[ndarray, "x y z"]
+    """Least distance in metres, float32, at which a particle of each cell is or may come to be seen, at least CLOSEST; infinite
+    where it never is."""
 
     @staticmethod
     def everything() -> Sight:
-        """All air is seen and needed."""
-        none = np.ones((0, 0, 0), bool)
+        """All air is seen and needed, from no distance."""
+        none = np.ones((0, 0, 0), np.float32)
         return Sight(np.zeros(3), np.ones(3), none, none)
 
     @staticmethod
@@ -91,25 +99,46 @@ class Sight:
         lower, size = np.asarray(domain.lower, float), np.asarray(domain.size, float)
         shape = _shape(size)
         cell = size / shape
-        seen = _seen(lower, cell, shape, _planes(cameras, distance, margin))
+        seen = np.full(tuple(shape), np.inf, np.float32)
+        _see(seen, lower, cell, *_views(cameras, distance, margin))
         needed = seen
-        if seen.any():
+        if np.isfinite(seen).any():
             reach = _reach(wind, domain.upper[2], slowest, fastest)
             needed = _swept(seen, _pattern(shape, cell, reach, wind.direction_degrees))
         return Sight(lower, cell, seen, needed)
 
     @property
+    def seen_cells(self) -> Bool[ndarray, "x y z"]:
+        """Cells that a camera may see."""
+        return np.isfinite(self.seen_distances)
+
+    @property
+    def needed_cells(self) -> Bool[ndarray, "x y z"]:
+        """Cells that are seen, or from which a particle may come into view."""
+        return np.isfinite(self.needed_distances)
+
+    @property
     def share(self) -> float:
         """Share of the domain that is needed, 0-1."""
-        return float(self.needed_cells.mean()) if self.needed_cells.size else 1.0
+        return float(self.needed_cells.mean()) if self.needed_distances.size else 1.0
 
-    def needed(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Whether a particle at each point is seen or may still come into view.
+    def needed(self, points: Float[ndarray, "n 3"], reaches: Float[ndarray, " n"] | None = None) -> Bool[ndarray, " n"]:
+        """Whether a particle at each point is seen within its reach, or may still come to be.
+
+        Args:
+            points: m; outside of the domain x and y are wrapped and z is clipped.
+            reaches: m; None: at any distance.
+        """
+        distances = self.distances(points)
+        return np.isfinite(distances) if reaches is None else distances <= reaches
+
+    def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
+        """Least distances in metres at which particles at these points are or may come to be seen; infinite for never.
 
         Args:
             points: m; outside of the domain x and y are wrapped and z is clipped.
         """
-        return self._look_up(self.needed_cells, points)
+        return self._look_up(self.needed_distances, points)
 
     def seen(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Whether a camera may see a particle at each point.
@@ -117,11 +146,11 @@ class Sight:
         Args:
             points: m; outside of the domain x and y are wrapped and z is clipped.
         """
-        return self._look_up(self.seen_cells, points)
+        return np.isfinite(self._look_up(self.seen_distances, points))
 
-    def _look_up(self, cells: Bool[ndarray, "x y z"], points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+    def _look_up(self, cells: Float[ndarray, "x y z"], points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
         if not cells.size:
-            return np.ones(len(points), bool)
+            return np.zeros(len(points), np.float32)
         at = np.floor((points - self.lower) / self.cell).astype(np.int64)
         return cells.ravel()[np.ravel_multi_index(tuple(at.T), cells.shape, mode=("wrap", "wrap", "clip"))]
 
@@ -144,8 +173,11 @@ def _shape(size: Float[ndarray, "3"]) -> Int[ndarray, "3"]:
     return np.ceil(size / cell).astype(int)
 
 
-def _planes(cameras: Cameras, distance: float, margin: float) -> Float[ndarray, "t 6 4"]:
-    """Planes `margin` metres outside of each pyramid of view: normal . x + offset >= 0 inside. Equal cameras are merged."""
+def _views(cameras: Cameras, distance: float, margin: float) -> tuple[Float[ndarray, "t 6 4"], Float[ndarray, "t 3"]]:
+    """Planes `margin` metres outside of each pyramid of view, and the cameras' centres; equal cameras are merged.
+
+    A plane is (normal, offset) with normal . x + offset >= 0 inside.
+    """
     viewmats = cameras.viewmats.detach().cpu().double().numpy()
     corners = np.array([[0, 0, 1], [cameras.width, 0, 1], [cameras.width, cameras.height, 1], [0, cameras.height, 1]], float)
     rays = corners @ np.linalg.inv(cameras.Ks.detach().cpu().double().numpy()).transpose(0, 2, 1)
@@ -156,30 +188,38 @@ def _planes(cameras: Cameras, distance: float, margin: float) -> Float[ndarray, 
     normals = np.concatenate([sides, depth], 1)
     offsets = normals @ viewmats[:, :3, 3:] + margin
     offsets[:, 5] += distance
-    return np.unique(np.concatenate([normals @ viewmats[:, :3, :3], offsets], 2), axis=0)
+    planes = np.concatenate([normals @ viewmats[:, :3, :3], offsets], 2)
+    centers = -(viewmats[:, :3, :3].transpose(0, 2, 1) @ viewmats[:, :3, 3:])[:, :, 0]
+    _, first = np.unique(planes.reshape(len(planes), -1), axis=0, return_index=True)
+    return planes[first], centers[first]
 
 
-def _seen(
-    lower: Float[ndarray, "3"], cell: Float[ndarray, "3"], shape: Int[ndarray, "3"], planes: Float[ndarray, "t 6 4"]
-) -> Bool[ndarray, "x y z"]:
-    """Cells that are seen by a camera: no plane of its pyramid has the whole cell outside.
-
-    The pyramid cuts one interval out of each column of cells.
-    """
-    x, y = (lower[axis] + cell[axis] * (np.arange(shape[axis]) + 0.5) for axis in range(2))
-    edges = np.zeros((shape[0] * shape[1], shape[2] + 1), np.int32)  # +1 where an interval begins, -1 behind its end
-    for plane in planes:
-        normal, offset = plane[:, :3], plane[:, 3] + np.abs(plane[:, :3]) @ cell / 2 + 1e-6
-        flat = normal[:, :1, None] * x[:, None] + normal[:, 1:2, None] * y + offset[:, None, None]
-        # Height at which a plane cuts the line through a column's centres; a nearly upright plane cuts it far away.
-        slope = np.where(np.abs(normal[:, 2]) < 1e-9, 1e-9, normal[:, 2])
-        height = ((-flat / slope[:, None, None] - lower[2]) / cell[2] - 0.5).clip(-1, shape[2])
-        first = np.ceil(height[slope > 0].max(0, initial=0.0)).astype(int).ravel()
-        behind = np.floor(height[slope < 0].min(0, initial=shape[2] - 1)).astype(int).ravel() + 1
-        columns = np.flatnonzero(first < behind)
-        edges[columns, first[columns]] += 1
-        edges[columns, behind[columns]] -= 1
-    return (np.cumsum(edges, 1)[:, :-1] > 0).reshape(shape)
+@numba.njit(cache=True, nogil=True)
+def _see(seen, lower, cell, planes, centers):
+    """Lower `seen` [x, y, z], metres, to the distance of a camera from each cell that no plane of its pyramid has outside."""
+    half = 0.5 * math.sqrt(cell[0] ** 2 + cell[1] ** 2 + cell[2] ** 2)
+    for view in range(len(planes)):
+        for i in range(seen.shape[0]):
+            x = lower[0] + cell[0] * (i + 0.5)
+            for j in range(seen.shape[1]):
+                y = lower[1] + cell[1] * (j + 0.5)
+                first, last = 0.0, float(seen.shape[2] - 1)
+                for plane in planes[view]:
+                    slack = abs(plane[0]) * cell[0] + abs(plane[1]) * cell[1] + abs(plane[2]) * cell[2]
+                    # The plane's value at the middle of the column's cell k is flat + rise k.
+                    rise = plane[2] * cell[2]
+                    flat = plane[0] * x + plane[1] * y + plane[2] * (lower[2] + 0.5 * cell[2]) + plane[3] + 0.5 * slack + 1e-6
+                    if abs(rise) < 1e-9:
+                        if flat < 0:
+                            last = -1.0
+                    elif rise > 0:
+                        first = max(first, math.ceil(-flat / rise))
+                    else:
+                        last = min(last, math.floor(-flat / rise))
+                for k in range(int(first), int(last) + 1):
+                    z = lower[2] + cell[2] * (k + 0.5)
+                    away = math.sqrt((x - centers[view, 0]) ** 2 + (y - centers[view, 1]) ** 2 + (z - centers[view, 2]) ** 2)
+                    seen[i, j, k] = min(seen[i, j, k], max(away - half, 0.0))
 
 
 def _reach(wind: Wind, top: float, slowest: float, fastest: float) -> Reach:
@@ -240,13 +280,28 @@ def _pattern(
     return np.maximum(arrival[:, :, None], early) <= late
 
 
-def _swept(seen: Bool[ndarray, "x y z"], pattern: Bool[ndarray, "x y dz"]) -> Bool[ndarray, "x y z"]:
-    """Cells from which some displacement of the pattern leads to a seen cell."""
+def _swept(seen: Float[ndarray, "x y z"], pattern: Bool[ndarray, "x y dz"]) -> Float[ndarray, "x y z"]:
+    """Least distance of the seen cells to which the displacements of the pattern lead from each cell.
+
+    Args:
+        seen: m; infinite where a cell is not seen.
+        pattern: possible displacements.
+    """
     layers = seen.shape[2]
     # A displacement d leads from i to i + d in x and y and to i - d in z: a correlation in x and y, a convolution in z with
     # offset layers - 1.
     turned = np.roll(pattern[::-1, ::-1], 1, (0, 1)).astype(float)
     # With so many layers, entries that wrap around the end stay outside of the layers that are kept.
     shape = (*seen.shape[:2], next_fast_len(2 * layers - 1, real=True) or 0)
-    spectrum = np.fft.rfftn(seen.astype(float), shape, (0, 1, 2)) * np.fft.rfftn(turned, shape, (0, 1, 2))
-    return np.fft.irfftn(spectrum, shape, (0, 1, 2))[:, :, layers - 1 : 2 * layers - 1] > 0.5
+    steps = np.fft.rfftn(turned, shape, (0, 1, 2))
+    found = np.full(seen.shape, np.inf, np.float32)
+    farthest, distance = float(seen[np.isfinite(seen)].max()), CLOSEST
+    while True:
+        within = seen <= NEARER * distance
+        if within.any():
+            reached = np.fft.irfftn(np.fft.rfftn(within.astype(float), shape, (0, 1, 2)) * steps, shape, (0, 1, 2))
+            needed = reached[:, :, layers - 1 : 2 * layers - 1] > 0.5
+            found = np.where(needed & np.isinf(found), np.float32(distance), found)
+        if NEARER * distance >= farthest:
+            return found
+        distance *= NEARER

@@ -8,7 +8,8 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.surface_response import Splash
 from pgsd_nerfstudio.physics.air.air import Air
-from pgsd_nerfstudio.physics.bodies import SPLASHED, Bodies
+from pgsd_nerfstudio.physics.air.emitters import Newcomers
+from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, SPLASHED, Bodies
 
 LIFT = 0.004  # m above the surface at which droplets start
 STEEP = (35.0, 65.0)  # degrees above the surface, between which droplets fly off
@@ -65,6 +66,11 @@ def splashed(
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True).clip(1e-9)
     steep = np.radians(rng.uniform(*STEEP, len(parent)))[:, None]
     velocity = fast[:, None] * (np.sin(steep) * normal + np.cos(steep) * tangent)
-    new = air.newborn(drops.positions[parent] + LIFT * normal, diameters, velocity, rng)
+    # What is seen of a crown is seen of it as a whole: all droplets of an impact share the draw of its drop.
+    reaches = np.minimum(splash.diameter * drops.reaches[parent].astype(np.float64), float(ANY_DISTANCE))
+    reaches[drops.reaches[parent] >= ANY_DISTANCE] = ANY_DISTANCE
+    new = air.newborn(Newcomers(drops.positions[parent] + LIFT * normal, diameters, reaches), velocity, rng)
+    needed = air.sight.needed(new.positions, new.reaches)
     new.represents[:] = drops.represents[parent]
+    new = new.select(needed)
     return new.marked(SPLASHED), share

@@ -119,6 +119,7 @@ class RunRecord:
             rest_quats=np.concatenate([rest.quats for _, rest in rests]),
             rest_extents=np.concatenate([rest.extents for _, rest in rests]),
             rest_covers=np.zeros(sum(len(ids) for ids, _ in rests), np.float32),
+            rest_represents=np.ones(sum(len(ids) for ids, _ in rests), np.float32),
             state=replace(RunState.empty(), flying=bodies, born=self.born),
         )
         return assemble([chunk], clock, {**about, "hanging": self.hanging})

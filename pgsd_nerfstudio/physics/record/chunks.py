@@ -55,6 +55,8 @@ class Chunk:
     rest_quats: Float[ndarray, "h 4"]
     rest_extents: Float[ndarray, " h"]
     rest_covers: Float[ndarray, " h"]
+    rest_represents: Float[ndarray, " h"]
+    """Real particles that each represents where it landed."""
     state: RunState
     """State at the end of the chunk."""
 
@@ -80,7 +82,7 @@ def save_chunk(folder: Path, index: int, chunk: Chunk) -> bool:
     """
     arrays = {name: getattr(chunk, name) for name in _ARRAYS} | with_prefix(_STATE, chunk.state.arrays())
     tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
-    plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born, "carry": chunk.state.carry.hex()}
+    plain = {"start": chunk.start, "frames": chunk.frames, "born": chunk.state.born}
     try:
         save_tensors(_path(folder, index), tensors, plain)
     except OSError:
@@ -104,7 +106,7 @@ def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | Non
     if (about.get("start"), about.get("frames")) != (start, frames):
         return None
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    state = RunState.of(without_prefix(_STATE, arrays), about["born"], float.fromhex(about["carry"]))
+    state = RunState.of(without_prefix(_STATE, arrays), about["born"])
     own = {name: value for name, value in arrays.items() if not name.startswith(_STATE)}
     return Chunk(start=start, frames=frames, state=state, **own)
 
@@ -138,6 +140,8 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     rest["rest_quats"][:, 0] = 1.0
     for name, value in rest.items():
         value[rests] = joined(name)
+    represents = joined("represents")
+    represents[rests] = joined("rest_represents")
     kinds = np.zeros(count, np.uint8)
     np.bitwise_or.at(kinds, joined("kind_ids"), joined("kind_bits"))
     arrays = {
@@ -149,7 +153,7 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         **rest,
         "quats": joined("quats"),
         "diameters": joined("diameters"),
-        "represents": joined("represents"),
+        "represents": represents,
         "reaches": joined("reaches"),
         "kinds": kinds,
     }

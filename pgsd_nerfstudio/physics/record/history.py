@@ -58,7 +58,7 @@ class ParticleHistory:
     diameters: Float[Tensor, " p"]
     """Metres."""
     represents: Float[Tensor, " p"]
-    """Real particles that each particle represents."""
+    """Real particles that each particle represents: where it was born, or where it landed."""
     reaches: Float[Tensor, " p"]
     """Metres up to which a camera shows each particle; `physics.air.emitters` draws them. 1e9: at any distance."""
     kinds: UInt8[Tensor, " p"]

@@ -106,6 +106,7 @@ class Log:
             rest_quats=rest.quats,
             rest_extents=rest.extents,
             rest_covers=covers,
+            rest_represents=landed.represents,
             state=state,
         )
 
