@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.rendering import choose_rasterizer
+from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rendering
 from pgsd_nerfstudio.rendering.reference import certain_pixels, render_reference
@@ -87,8 +88,32 @@ def test_dropping_what_opaque_walls_hide_changes_no_bit():
     found = rasterizer.render(cameras, dynamic)
     everything = CpuRasterizer(Gaussians.empty()).render(cameras, concatenate([frozen, dynamic]))
     _, view = rasterizer.views.get(cameras.viewmats[0], cameras.Ks[0], 64, 48)
-    assert len(view.part.splats) < 0.7 * len(frozen)  # otherwise nothing was dropped
+    assert isinstance(view.part, Binned) and len(view.part.splats) < 0.7 * len(frozen)  # otherwise nothing was dropped
     assert torch.equal(found.rgb, everything.rgb)
+
+
+@pytest.mark.parametrize("moving", [0, 3, 200])
+def test_what_is_shown_once_is_blended_at_once_and_has_the_bits_of_what_is_shown_again(moving):
+    """The frozen scene is blended alone for the second picture; a picture with gradient, or of layers, wants that at once."""
+    wall = random_gaussians(60, 9, size=1.0)
+    frozen = concatenate([replace(wall, means=wall.means + torch.tensor([0.0, 0.0, 1.0])), random_gaussians(400, 10)])
+    cameras, dynamic = random_cameras(1, 70, 50), random_gaussians(moving, 11)
+    rasterizer = CpuRasterizer(frozen)
+    clips, sizes = [], []
+    for _ in range(3):
+        clips.append(rasterizer.render(cameras, dynamic))
+        sizes.append(rasterizer.views.nbytes)
+    for again in clips[1:]:
+        for name in Rendering._fields:
+            assert torch.equal(getattr(clips[0], name), getattr(again, name)), name
+    assert sizes[0] != sizes[1] or not moving
+    assert sizes[1] == sizes[2]
+    leaf = replace(dynamic, opacities=dynamic.opacities.clone().requires_grad_())
+    for other in (CpuRasterizer(frozen), CpuRasterizer(frozen, layers=4)):
+        other.render(cameras, leaf)
+        kept = other.views.nbytes
+        other.render(cameras, leaf)
+        assert kept == other.views.nbytes
 
 
 def test_each_camera_has_its_own_dynamic_set():
@@ -153,16 +178,16 @@ def test_several_python_threads_may_render():
 
 def test_threads_prepare_views_one_after_the_other(monkeypatch):
     rasterizer, inside, most = CpuRasterizer(random_gaussians(20)), [], []
-    make = rasterizer.views._make
+    make = rasterizer.views._blended
 
-    def slow(view, gaussians):
+    def slow(binned, view):
         inside.append(view)
         most.append(len(inside))
         time.sleep(0.05)
         inside.pop()
-        return make(view, gaussians)
+        return make(binned, view)
 
-    monkeypatch.setattr(rasterizer.views, "_make", slow)
+    monkeypatch.setattr(rasterizer.views, "_blended", slow)
     cameras = random_cameras(1, 16, 16)
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(lambda _: rasterizer.render(cameras), range(4)))

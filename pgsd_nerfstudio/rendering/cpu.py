@@ -17,7 +17,7 @@ from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
-from pgsd_nerfstudio.rendering.walk import blend_backward, blend_merged
+from pgsd_nerfstudio.rendering.walk import blend_at_once, blend_backward, blend_merged
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
@@ -77,8 +77,14 @@ class CpuRasterizer:
         at = moment_per_frame(moments, len(cameras))
         frames = []
         for k, (moving, moment) in enumerate(zip(dynamic_per_frame(dynamic, len(cameras)), at, strict=True)):
-            view, frozen = self.views.get(cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height, moment)
+            # The backward pass walks over the frozen list once more, which a view that is blended alone makes shorter.
+            once = moving is not None and not (
+                torch.is_grad_enabled() and any(tensor.requires_grad for tensor in moving.tensors.values())
+            )
+            camera = cameras.viewmats[k], cameras.Ks[k], cameras.width, cameras.height
+            view, frozen = self.views.get(*camera, moment, once=once)
             if moving is None:
+                assert frozen.image is not None
                 frames.append(torch.from_numpy(frozen.image))
             else:
                 colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
@@ -120,11 +126,15 @@ class _RenderMerged(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, drawn: _Drawn, *tensors: Tensor) -> Tensor:
         dynamic, ids = splat(Gaussians(*tensors, **drawn._asdict()), view)
-        image = frozen.image.copy()
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
-        scene = dynamic, width, height, *limits, image
-        blend_merged(frozen.part, *scene)
+        if frozen.image is None:
+            assert isinstance(frozen.part, Binned)
+            image = np.empty((5, height, width), np.float32)
+            blend_at_once(frozen.part, dynamic, width, height, *limits, image)
+        else:
+            image = frozen.image.copy()
+            blend_merged(frozen.part, dynamic, width, height, *limits, image)
         ctx.save_for_backward(*tensors)
         ctx.walk = _Walk(view, frozen.part, dynamic, drawn, ids, limits, image)
         return torch.from_numpy(image)

@@ -3,6 +3,9 @@
 Projecting, sorting and binning a large scene costs more than blending a small image of it. The scene never changes, so this is
 done once for each camera. The saving is exact: no picture differs by a bit. If the scene is also pressed into layers
 (layers.py), a frame costs hardly more than its dynamic Gaussians, at a small error.
+
+What a camera and a moment see once, such as a frame of a video, is projected, sorted and binned only, and blended together with
+what moves. The scene is blended alone when the same view is asked for again.
 """
 
 from __future__ import annotations
@@ -37,12 +40,12 @@ class FrozenView(NamedTuple):
 
     part: Binned | Layers
     """The frozen splats or layers that dynamic splats are merged with."""
-    image: np.ndarray
-    """[5, h, w] float32 as in blending.py: the frozen scene alone, without background."""
+    image: np.ndarray | None
+    """[5, h, w] float32 as in blending.py: the frozen scene alone, without background; None before it is blended alone."""
 
     @property
     def nbytes(self) -> int:
-        return self.part.nbytes + self.image.nbytes
+        return self.part.nbytes + (0 if self.image is None else self.image.nbytes)
 
 
 def float_array(tensor: torch.Tensor) -> np.ndarray:
@@ -117,7 +120,14 @@ class FrozenViews:
         return f"{self._cache} ({'exact' if self._layers is None else f'{self._layers} layers'})"
 
     def get(
-        self, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, moment: Moment | None = None
+        self,
+        viewmat: torch.Tensor,
+        K: torch.Tensor,
+        width: int,
+        height: int,
+        moment: Moment | None = None,
+        *,
+        once: bool = False,
     ) -> tuple[View, FrozenView]:
         """The view of one camera at a moment, prepared if it is not kept.
 
@@ -127,25 +137,33 @@ class FrozenViews:
             width: of the image in pixels.
             height: of the image in pixels.
             moment: how the weather changes the frozen scene; None leaves it.
+            once: whether an exact view that is asked for the first time may come without its image.
         """
         intrinsics = K.detach().cpu().double().numpy()
         pose = np.ascontiguousarray(viewmat.detach().cpu().double().numpy())
         view = View(pose, lens(intrinsics, width, height, self._config))
+
+        def again(kept: FrozenView) -> FrozenView:
+            return kept if isinstance(kept.part, Layers) or kept.image is not None else self._blended(kept.part, view)
+
+        def prepared(gaussians: Gaussians, shade: Shade | None = None) -> FrozenView:
+            binned, _ = splat(gaussians, view, shade)
+            return FrozenView(binned, None) if once and self._layers is None else self._blended(binned, view)
+
         if moment is None:
-            return view, self._cache.get(viewmat, K, width, height, lambda: self._make(view, self._gaussians))
+            return view, self._cache.get(viewmat, K, width, height, lambda: prepared(self._gaussians), again=again)
         seen_from = Viewpoint(viewmat.detach().cpu().float(), K.detach().cpu().float(), width, height)
 
         def make() -> FrozenView:
             def shade(rgb: torch.Tensor, means: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
                 return moment.frozen_colors(rgb, means, ids, seen_from)
 
-            return self._make(view, moment.altered(self._gaussians), shade)
+            return prepared(moment.altered(self._gaussians), shade)
 
-        return view, self._cache.get(viewmat, K, width, height, make, moment.key)
+        return view, self._cache.get(viewmat, K, width, height, make, moment.key, again)
 
-    def _make(self, view: View, gaussians: Gaussians, shade: Shade | None = None) -> FrozenView:
+    def _blended(self, binned: Binned, view: View) -> FrozenView:
         width, height = view.lens.width, view.lens.height
-        binned, _ = splat(gaussians, view, shade)
         needed = np.zeros(len(binned.entries), bool)
         image = np.empty((5, height, width), np.float32)
         limits = np.float32(self._config.max_alpha), np.float32(self._config.min_transmittance)

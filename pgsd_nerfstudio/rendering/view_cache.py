@@ -52,6 +52,7 @@ class ViewCache(Generic[V]):
         height: int,
         make: Callable[[], V],
         moment: bytes = b"",
+        again: Callable[[V], V] | None = None,
     ) -> V:
         """The view of a camera at a moment, made if it is not kept.
 
@@ -62,14 +63,21 @@ class ViewCache(Generic[V]):
             height: of the image in pixels.
             make: makes the view.
             moment: key of the moment.
+            again: what becomes of a kept view when it is asked for again; None: it stays.
         """
         numbers = torch.cat([viewmat.flatten(), K.flatten()]).detach().cpu().double().numpy()
         key = numbers.tobytes() + f"{width}x{height}".encode() + moment
         with self._lock:
-            if key in self._views:
+            kept = self._views.get(key)
+            if kept is not None:
                 self._views.move_to_end(key)
-                return self._views[key]
-            made = make()
+                made = kept if again is None else again(kept)
+                if made is kept:
+                    return kept
+                del self._views[key]
+                self.nbytes -= kept.nbytes
+            else:
+                made = make()
             if made.nbytes <= self.cache_bytes:
                 self._views[key] = made
                 self.nbytes += made.nbytes

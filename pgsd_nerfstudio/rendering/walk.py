@@ -130,17 +130,29 @@ def blend_merged(
     image: np.ndarray,  # [5, h, w] float32, changed
 ) -> None:
     """Blend the tiles that have dynamic splats again, in an image as `blend_frozen` left it."""
-    count = workers()
-    share_out(
-        _blend_merged, count, aligned(count, TILE, ROW), frozen, dynamic, width, height, max_alpha, min_transmittance, image
-    )
+    limits = width, height, max_alpha, min_transmittance
+    share_out(_blend_merged, workers(), aligned(workers(), TILE, ROW), frozen, dynamic, False, *limits, image)
+
+
+def blend_at_once(
+    frozen: Binned,
+    dynamic: Binned,
+    width: int,
+    height: int,
+    max_alpha: np.float32,
+    min_transmittance: np.float32,
+    image: np.ndarray,  # [5, h, w] float32, written
+) -> None:
+    """Blend all tiles: the image of `blend_frozen` and `blend_merged`, to the bit, in one walk that prepares nothing."""
+    limits = width, height, max_alpha, min_transmittance
+    share_out(_blend_merged, workers(), aligned(workers(), TILE, ROW), frozen, dynamic, True, *limits, image)
 
 
 @kernel()
-def _blend_merged(worker, workers, tiles, frozen, dynamic, width, height, max_alpha, min_transmittance, image):
+def _blend_merged(worker, workers, tiles, frozen, dynamic, everywhere, width, height, max_alpha, min_transmittance, image):
     tile = tiles[worker]
     for t in range(worker, tiles_of(width, height), workers):
-        if dynamic.offsets[t] == dynamic.offsets[t + 1]:
+        if not everywhere and dynamic.offsets[t] == dynamic.offsets[t + 1]:
             continue
         left, top, columns, rows = pixels_of(t, width, height)
         clear(tile, ROW, columns, rows)
