@@ -143,9 +143,9 @@ def test_in_still_air_the_air_above_what_is_seen_is_needed_and_no_more():
 
 @pytest.mark.parametrize("degrees", [0.0, 90.0, 205.0])
 def test_steady_wind_spreads_need_upwind_by_the_time_of_the_fall(degrees):
-    """From a seen place to (fall height) / (fall speed) x (wind at the top) upwind of it, around the box."""
+    """From a seen place to (fall height) / (fall speed) x (wind at the top) upwind of it."""
     wind = Wind(speed=2.0, direction_degrees=degrees, gustiness=0.0, turbulence=0.0, flutter=0.0)
-    camera = looking((8.0, -9.0, 0.5), (8.6, -8.8, 0.5), 10.0)
+    camera = looking((1.0, -2.0, 0.5), (1.6, -1.8, 0.5), 10.0)
     found = sight(camera, wind=wind, distance=0.1)
     x, y, z = np.moveaxis(centers(found), -1, 0)
     angle, top = math.radians(degrees), 2.0 * law_of_the_wall(np.array([5.0]), 0.03, 2.0)[0]
@@ -154,14 +154,10 @@ def test_steady_wind_spreads_need_upwind_by_the_time_of_the_fall(degrees):
     for grown in (-1e-9, slack):
         reached = np.zeros(x.shape, bool)
         for a, b, c in zip(seen_x, seen_y, seen_z, strict=True):
-            for i in (-20.0, 0.0, 20.0):
-                for j in (-20.0, 0.0, 20.0):
-                    along = (a - x - i) * math.cos(angle) + (b - y - j) * math.sin(angle)
-                    across = (b - y - j) * math.cos(angle) - (a - x - i) * math.sin(angle)
-                    most = top * np.maximum(z - c + max(grown, 0), 0) * 1.01
-                    reached |= (
-                        (np.abs(across) <= max(grown, 0.01)) & (along >= -grown) & (along <= most + grown) & (z >= c - grown)
-                    )
+            along = (a - x) * math.cos(angle) + (b - y) * math.sin(angle)
+            across = (b - y) * math.cos(angle) - (a - x) * math.sin(angle)
+            most = top * np.maximum(z - c + max(grown, 0), 0) * 1.01
+            reached |= (np.abs(across) <= max(grown, 0.01)) & (along >= -grown) & (along <= most + grown) & (z >= c - grown)
         expected.append(reached)
     least, most = expected
     assert least.sum() > 20
@@ -170,7 +166,7 @@ def test_steady_wind_spreads_need_upwind_by_the_time_of_the_fall(degrees):
 
 
 def ways(wind: Wind, slowest: float, fastest: float, seed: int, seconds: float):
-    """Places [t, n, 3] of particles in the box, in at one side when out at the other, and whether they are above its ground."""
+    """Places [t, n, 3] of particles that begin in the box, and whether they have been in it all the time."""
     rng = np.random.default_rng(seed)
     field, count, step = WindField.draw(wind, seed), 3000, 0.05
     position = (LOWER + rng.uniform(size=(count, 3)) * SIZE).astype(np.float32)
@@ -185,9 +181,8 @@ def ways(wind: Wind, slowest: float, fastest: float, seed: int, seconds: float):
     places, alive = [position.copy()], [np.ones(count, bool)]
     for index in range(round(seconds / step)):
         advance(position, velocity, speed, flutter, field, index * step, step)
-        position[:, :2] = LOWER[:2] + (position[:, :2] - LOWER[:2]) % SIZE[:2]
         places.append(position.copy())
-        alive.append(alive[-1] & (position[:, 2] >= LOWER[2]))
+        alive.append(alive[-1] & ((position >= LOWER) & (position <= LOWER + SIZE)).all(1))
     return np.stack(places), np.stack(alive)
 
 
@@ -216,7 +211,7 @@ def test_no_particle_that_comes_into_sight_was_ever_dropped(weather):
             later = np.maximum.accumulate(entered[::-1], 0)[::-1]  # comes into sight now or later
             assert one.needed(places[later]).all()
             watched += entered.any(0).sum()
-    assert watched > 150
+    assert watched > 120
 
 
 @pytest.mark.parametrize("time", [1.0, 5.0, 10.0])
@@ -310,17 +305,16 @@ def test_without_cameras_everything_is_needed(found):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_outside_of_the_box_counts_what_is_inside_around_the_corner(dtype):
+def test_outside_of_the_box_counts_the_nearest_cell(dtype):
     found = sight(NARROW, wind=Wind())
     inside = centers(found).reshape(-1, 3).astype(dtype)
-    answer = found.needed(inside)
-    assert np.array_equal(answer, found.needed_cells.ravel())
-    for laps in ((1, 0), (-1, 2), (0, -3)):
-        assert np.array_equal(found.needed(inside + np.array([*(laps * SIZE[:2]), 0.0], dtype)), answer)
-    rise = np.array([0.0, 0.0, 50.0], dtype)
-    for sign, layer in ((1, -1), (-1, 0)):
-        column = inside.reshape(*found.needed_cells.shape, 3)[:, :, 0].reshape(-1, 3)
-        assert np.array_equal(found.needed(column + sign * rise), found.needed_cells[:, :, layer].ravel())
+    assert np.array_equal(found.needed(inside), found.needed_cells.ravel())
+    for axis in range(3):
+        for sign, layer in ((1, -1), (-1, 0)):
+            face = centers(found).astype(dtype).take(layer, axis).reshape(-1, 3)
+            away = np.zeros(3, dtype)
+            away[axis] = sign * 50.0
+            assert np.array_equal(found.needed(face + away), found.needed_cells.take(layer, axis).ravel())
 
 
 def test_large_boxes_get_larger_cells():

@@ -19,8 +19,7 @@ seconds are:
 
 Inertia adds nothing, since velocities under drag are means of past settled velocities.
 
-The domain is periodic in x and y: a particle that leaves at one side enters at the opposite side. Possible displacements
-therefore form one pattern on a torus, the same for all cells, and the needed cells are the seen cells convolved with that
+Possible displacements form one pattern, the same for all cells, and the needed cells are the seen cells convolved with that
 pattern: one Fourier transform for the cells within each of a ladder of distances, whose steps are NEARER.
 """
 
@@ -48,7 +47,6 @@ NEARER = 1.15  # ratio of the distances that are told apart; a needed cell takes
 DEVIATIONS = 3.0  # standard deviations of gusts and of the turbulent walk
 GUST_RATES = (0.2, 1.25)  # lowest and highest, as `wind` draws them: hertz times `gust_seconds`
 WIDEST_SWAY, SLOWEST_SWAY = 1.7, 0.6  # bounds of the flutter's speed and hertz that `Air.newborn` draws, as factors
-LAPS = 2  # times around the domain that are told apart; a particle that moves farther may be anywhere
 INSTANTS = np.concatenate([[0.0], np.geomspace(1e-3, 1e6, 2048)])  # s; 1% apart
 
 
@@ -126,7 +124,7 @@ class Sight:
         """Whether a particle at each point is seen within its reach, or may still come to be.
 
         Args:
-            points: m; outside of the domain x and y are wrapped and z is clipped.
+            points: m; outside of the domain that of the nearest cell counts.
             reaches: m; None: at any distance.
         """
         distances = self.distances(points)
@@ -136,7 +134,7 @@ class Sight:
         """Least distances in metres at which particles at these points are or may come to be seen; infinite for never.
 
         Args:
-            points: m; outside of the domain x and y are wrapped and z is clipped.
+            points: m; outside of the domain that of the nearest cell counts.
         """
         return self._look_up(self.needed_distances, points)
 
@@ -144,7 +142,7 @@ class Sight:
         """Whether a camera may see a particle at each point.
 
         Args:
-            points: m; outside of the domain x and y are wrapped and z is clipped.
+            points: m; outside of the domain that of the nearest cell counts.
         """
         return np.isfinite(self._look_up(self.seen_distances, points))
 
@@ -152,7 +150,7 @@ class Sight:
         if not cells.size:
             return np.zeros(len(points), np.float32)
         at = np.floor((points - self.lower) / self.cell).astype(np.int64)
-        return cells.ravel()[np.ravel_multi_index(tuple(at.T), cells.shape, mode=("wrap", "wrap", "clip"))]
+        return cells.ravel()[np.ravel_multi_index(tuple(at.T), cells.shape, mode="clip")]
 
 
 class Reach(NamedTuple):
@@ -249,8 +247,8 @@ def _reach(wind: Wind, top: float, slowest: float, fastest: float) -> Reach:
 
 def _pattern(
     shape: Int[ndarray, "3"], cell: Float[ndarray, "3"], reach: Reach, direction_degrees: float
-) -> Bool[ndarray, "x y dz"]:
-    """Which displacements in cells are possible: x and y modulo the domain, then down by -(z - 1) ... z - 1 cells.
+) -> Bool[ndarray, "dx dy dz"]:
+    """Which displacements in cells are possible: by -(n - 1) ... n - 1 cells along x, along y, and down.
 
     Each axis gives the intervals of time in which it allows the displacement; the displacement is possible if they have one in
     common. Points in cells n apart are n - 1 to n + 1 cells apart; the bounds take the distance that is easiest to reach.
@@ -261,11 +259,7 @@ def _pattern(
     early = np.maximum(early, possible.argmax(1))
     late = np.where(possible.any(1), len(reach.down) - 1 - possible[:, ::-1].argmax(1), -1)
 
-    # All cells up to LAPS around the domain, laid out in a plane. A particle that had time to move farther may be anywhere.
-    farthest = np.hypot(np.maximum(reach.with_wind, reach.against_wind), reach.across)
-    size = shape[:2] * cell[:2]
-    laps = np.minimum(LAPS, np.ceil(farthest[late.max()] / size)).astype(int)
-    x, y = (cell[axis] * np.arange(-(laps[axis] + 1) * shape[axis], (laps[axis] + 1) * shape[axis]) for axis in range(2))
+    x, y = (cell[axis] * np.arange(1 - shape[axis], shape[axis]) for axis in range(2))
     angle = math.radians(direction_degrees)
     cos, sin = math.cos(angle), math.sin(angle)
     along, across = cos * x[:, None] + sin * y, cos * y - sin * x[:, None]
@@ -275,32 +269,28 @@ def _pattern(
         np.searchsorted(reach.with_wind, along - slack_along), np.searchsorted(reach.against_wind, -along - slack_along)
     )
     arrival = np.maximum(arrival, np.searchsorted(reach.across, np.abs(across) - slack_across))
-    arrival = arrival.reshape(2 * (laps[0] + 1), shape[0], 2 * (laps[1] + 1), shape[1]).min((0, 2))
-    arrival = np.minimum(arrival, np.searchsorted(farthest, ((laps + 1) * size - cell[:2]).min()))
     return np.maximum(arrival[:, :, None], early) <= late
 
 
-def _swept(seen: Float[ndarray, "x y z"], pattern: Bool[ndarray, "x y dz"]) -> Float[ndarray, "x y z"]:
+def _swept(seen: Float[ndarray, "x y z"], pattern: Bool[ndarray, "dx dy dz"]) -> Float[ndarray, "x y z"]:
     """Least distance of the seen cells to which the displacements of the pattern lead from each cell.
 
     Args:
         seen: m; infinite where a cell is not seen.
         pattern: possible displacements.
     """
-    layers = seen.shape[2]
-    # A displacement d leads from i to i + d in x and y and to i - d in z: a correlation in x and y, a convolution in z with
-    # offset layers - 1.
-    turned = np.roll(pattern[::-1, ::-1], 1, (0, 1)).astype(float)
-    # With so many layers, entries that wrap around the end stay outside of the layers that are kept.
-    shape = (*seen.shape[:2], next_fast_len(2 * layers - 1, real=True) or 0)
-    steps = np.fft.rfftn(turned, shape, (0, 1, 2))
+    # A displacement d leads from i to i + d in x and y and to i - d in z: a correlation in x and y, a convolution in z. With
+    # transforms of 2 n - 1 entries along each axis, those that wrap around the end stay outside of the n that are kept.
+    shape = tuple(next_fast_len(2 * count - 1, real=True) or 0 for count in seen.shape)
+    steps = np.fft.rfftn(pattern[::-1, ::-1].astype(float), shape, (0, 1, 2))
+    kept = tuple(slice(count - 1, 2 * count - 1) for count in seen.shape)
     found = np.full(seen.shape, np.inf, np.float32)
     farthest, distance = float(seen[np.isfinite(seen)].max()), CLOSEST
     while True:
         within = seen <= NEARER * distance
         if within.any():
             reached = np.fft.irfftn(np.fft.rfftn(within.astype(float), shape, (0, 1, 2)) * steps, shape, (0, 1, 2))
-            needed = reached[:, :, layers - 1 : 2 * layers - 1] > 0.5
+            needed = reached[kept] > 0.5
             found = np.where(needed & np.isinf(found), np.float32(distance), found)
         if NEARER * distance >= farthest:
             return found
