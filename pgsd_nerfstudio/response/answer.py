@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -22,16 +23,18 @@ from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
+from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.weather_light import in_weather
 from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, wet_share
-from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.rendering.medium import Medium
     from pgsd_nerfstudio.response.edits import Edits
     from pgsd_nerfstudio.response.haze_field import HazeField
+    from pgsd_nerfstudio.response.puddles import Puddles, PuddlesNow
 
 FAR = 3000.0  # m; distance of the sky for the haze
 OPAQUE_UNDER = 1.5  # a full cover adds the opacity of this many more Gaussians in the same place
@@ -57,6 +60,10 @@ class Answer:
     edits: Edits | None = None
     seconds: float = 10.0
     """Second at which the edited pictures are reached in full."""
+    puddles: Puddles | None = None
+    """Water that stands, mirrors and ripples; None: wet surfaces mirror the even sky."""
+    layer: Layer | None = None
+    """Cover that lies on the surface of the scene as Gaussians of its own; None: there is none."""
     number: int = field(default_factory=lambda: next(_numbers))
     """Number of this object in the process, by which caches tell answers apart."""
 
@@ -69,11 +76,13 @@ class Answer:
 
     def to(self, device: torch.device | str) -> Answer:
         """The same answer on another device."""
-        return self._each(lambda tensor: tensor.to(device), up=self.up.to(device))
+        layer = None if self.layer is None else self.layer.to(device)
+        return self._each(lambda tensor: tensor.to(device), up=self.up.to(device), layer=layer)
 
     def select(self, which: Tensor) -> Answer:
         """The answer of some of the Gaussians, by mask or by index."""
-        return self._each(lambda tensor: tensor[which])
+        layer = None if self.layer is None else self.layer.on(which, len(self.exposure.sky))
+        return self._each(lambda tensor: tensor[which], layer=layer)
 
     def thicker(self, factor: float) -> Answer:
         """The same answer with the extinction of its haze multiplied by `factor`."""
@@ -88,6 +97,7 @@ class Answer:
             coating=_mapped(self.coating, change),
             edits=None if self.edits is None else _mapped(self.edits, change),
             softening=None if self.softening is None else change(self.softening),
+            puddles=None if self.puddles is None else self.puddles.each(change),
             number=next(_numbers),
             **others,
         )
@@ -121,7 +131,7 @@ class Shown:
     @property
     def changes(self) -> bool:
         """Whether the scene looks different from the frozen scene."""
-        coated = bool((self.hidden > 0).any()) or bool((self.wet > 0).any())
+        coated = bool((self.hidden > 0).any()) or bool((self.wet > 0).any()) or self.pieces is not None
         lights = self.answer.effect.ambience is not None and self.share > 0
         return coated or lights or self.medium is not None or (self.answer.edits is not None and self.seconds > 0)
 
@@ -130,14 +140,41 @@ class Shown:
         """Share of the full weather, 0..1."""
         return self.answer.effect.timeline.share(self.seconds)
 
+    @cached_property
+    def pieces(self) -> tuple[Int[Tensor, " k"], Float[Tensor, " k"], Float[Tensor, " k"]] | None:
+        """Pieces of the layer that are there, as `Layer.grown`; None if there are none or if edited pictures show the cover."""
+        if self.answer.layer is None or self.answer.edits is not None:
+            return None
+        grown = self.answer.layer.grown(self.answer.effect, self.seconds)
+        return grown if len(grown[0]) else None
+
+    @cached_property
+    def puddles(self) -> PuddlesNow | None:
+        """The puddles of the moment; None if the effect leaves none."""
+        return None if self.answer.puddles is None else self.answer.puddles.at(self.seconds)
+
+    def adds(self, view: Viewpoint) -> Gaussians | None:
+        """The rings of drops on standing water near a camera, in scene units; None if it sees none.
+
+        Args:
+            view: the camera.
+        """
+        if self.puddles is None or self.share == 0:
+            return None
+        return self.puddles.rings(view, lambda ids: self.lit(self.answer.puddles.rgb[ids], ids, None), self.share)
+
     def altered(self, frozen: Gaussians) -> Gaussians:
-        """The frozen Gaussians with the edits; without edits they are wider and more opaque under a cover."""
+        """The frozen Gaussians with the edits; without edits they are wider and more opaque under a cover, and followed by the
+        pieces of the layer."""
         if self.answer.edits is not None:
             return self.answer.edits.applied(frozen, self.answer.share_of_edits(self.seconds))
-        if not bool((self.hidden > 0).any()):
+        if not bool((self.hidden > 0).any()) and self.pieces is None:
             return frozen
         opacities = 1 - (1 - frozen.opacities) ** (1 + OPAQUE_UNDER * self.hidden)
-        return replace(frozen, opacities=opacities, scales=frozen.scales * (1 + WIDER_UNDER * self.hidden[:, None]))
+        wider = replace(frozen, opacities=opacities, scales=frozen.scales * (1 + WIDER_UNDER * self.hidden[:, None]))
+        if self.answer.layer is None or self.pieces is None:
+            return wider
+        return concatenate([wider, self.answer.layer.gaussians(*self.pieces, like=frozen)])
 
     def frozen_colors(
         self, rgb: Float[Tensor, "m 3"], means: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], view: Viewpoint
@@ -147,7 +184,7 @@ class Shown:
         Args:
             rgb: sRGB from the direction of the view, without weather.
             means: centres in scene units.
-            ids: indices of these Gaussians in the frozen scene.
+            ids: indices of these Gaussians in the scene as `altered` returns it.
             view: the camera.
         """
         towards = torch.nn.functional.normalize(view.center - means, dim=1) @ self.answer.up.T.to(means)
@@ -177,11 +214,23 @@ class Shown:
 
         Args:
             rgb: sRGB without weather.
-            ids: indices of these Gaussians in the frozen scene.
+            ids: indices of these Gaussians in the scene as `altered` returns it.
             towards: metric unit vectors to the camera; None: wet surfaces mirror nothing.
         """
+        return encoded(self._light(linear(rgb), ids, towards))
+
+    def _light(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
+        total = len(self.hidden)
+        if self.answer.layer is None or self.pieces is None:
+            return self._scene_light(light, ids, towards)
+        own, found = ids < total, torch.empty_like(light)
+        found[own] = self._scene_light(light[own], ids[own], None if towards is None else towards[own])
+        lying = self.answer.layer.light(self.pieces[0], self.answer.effect.appearance.collided.rgb)
+        found[~own] = lying[ids[~own] - total].to(light)
+        return found
+
+    def _scene_light(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
         effect, exposure, edited = self.answer.effect, self.answer.exposure, self.answer.edits is not None
-        light = linear(rgb)
         # Edited pictures already show light, water and cover; only the mirror, which depends on the camera, is added.
         if effect.ambience is not None and not edited:
             softening = self.answer.softening
@@ -189,13 +238,17 @@ class Shown:
         if effect.surface.landing == "wets":
             wet = wet_share(light, self.wet[ids])
             light = light if edited else darkened(light, wet)
-            if towards is not None:
+            if towards is not None and self.puddles is not None:
+                seen = towards, exposure.normals[ids], exposure.loose[ids]
+                mirror, kept = self.puddles.mirror(ids, *seen, wet[:, 0], self.share)
+                light = light * (1 - kept[:, None]) + mirror
+            elif towards is not None:
                 sky = (effect.ambience or Ambience()).sky
                 light = light + wet * mirrored_sky(exposure.normals[ids], exposure.level[ids], exposure.sky[ids], towards, sky)
         if edited:
-            return encoded(light)
+            return light
         cover = cover_light(light, effect.appearance.collided.rgb, exposure.sky[ids])
-        return encoded(torch.lerp(light, cover, self.hidden[ids, None].to(light)))
+        return torch.lerp(light, cover, self.hidden[ids, None].to(light))
 
 
 def _mapped(record: R, change: Callable[[Tensor], Tensor]) -> R:
@@ -215,8 +268,9 @@ def baked(shown: Shown | None, frozen: Gaussians) -> Gaussians:
         return frozen
     frozen = shown.altered(frozen)
     constant = 0.5 + SH_C0 * frozen.colors[:, 0]
+    hidden = torch.cat([shown.hidden.to(constant), constant.new_ones(len(frozen) - len(shown.hidden))])
     after = shown.lit(constant, torch.arange(len(frozen), device=frozen.device), None)
     dimmed = luminance(after.clamp_min(0)) / luminance(constant.clamp_min(0)).clamp_min(1e-3)
-    left = dimmed.clamp(0, 1) * (1 - shown.hidden.to(after))
+    left = dimmed.clamp(0, 1) * (1 - hidden)
     bands = [((after - 0.5) / SH_C0)[:, None], frozen.colors[:, 1:] * left[:, None, None]]
     return replace(frozen, colors=torch.cat(bands, dim=1))

@@ -2,8 +2,8 @@
 
 The cover grows by the falling mass that each Gaussian catches (`exposure`), in the time lapse of the effect. It stays a film on
 slopes above the angle of repose, and nothing stays where the slope does not hold it. The water follows dw/dt = rain - w / tau,
-the balance of `physics.ground.wetness`, at every place by itself. The visible share is 1 - exp(-x / x0), since a thin cover
-leaves some spots bare and a light rain leaves some dry (x0 of the cover: SurfaceResponse.hides, of the water:
+the balance of `physics.ground.wetness`, at every place by itself. A thin cover leaves some spots bare (`patchiness`), and a
+light rain leaves some dry: the share that is wet is 1 - exp(-x / x0) (x0 of the cover: SurfaceResponse.hides, of the water:
 SurfaceResponse.darkens).
 """
 
@@ -22,10 +22,10 @@ from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.ground.wetness import Wetting
 from pgsd_nerfstudio.physics.laws.populations import MM_PER_HOUR, fall_speed, integral, number_density
 from pgsd_nerfstudio.response.exposure import LOOSE_MOST, Exposure
+from pgsd_nerfstudio.response.patchiness import covered_share, hidden_share, ranks
 
 ROUGHNESS = 0.35  # standard deviation of the logarithm of the caught mass, so that no edge of a cover is a straight line
 PATCHES = (0.15, 1.5)  # m; shortest and longest wavelength of that variation
-SHARPNESS = 1.6  # exponent of the cover's thickness: the first flakes fall between blades and stones and are not seen
 STEPS_PER_SECOND = 50  # of the balance of water, whose time constant is minutes
 
 
@@ -41,6 +41,8 @@ class Coating:
     """Greatest share of the Gaussian that a cover can hide, 0..1."""
     water_rate: Float[Tensor, " n"]
     """Water in kg/(m^2 s) in full rain."""
+    rank: Float[Tensor, " n"]
+    """Order in which Gaussians are hidden, 0..1."""
     effect: Effect
 
     @staticmethod
@@ -66,6 +68,8 @@ class Coating:
             thickest=torch.where(steep, response.film, math.inf),
             most=torch.where(exposure.loose, LOOSE_MOST, 1.0),
             water_rate=rate if response.landing == "wets" else none,
+            # Each leaf is hidden by itself; ground and walls in patches.
+            rank=torch.where(exposure.loose, ranks(metric, seed, grain=1.0), ranks(metric, seed)),
             effect=effect,
         )
 
@@ -75,7 +79,7 @@ class Coating:
 
     def hidden(self, seconds: float) -> Float[Tensor, " n"]:
         """Share of each Gaussian that the cover hides at a second, 0..1."""
-        return self.most * -torch.expm1(-((self.thickness(seconds) / self.effect.surface.hides) ** SHARPNESS))
+        return self.most * hidden_share(covered_share(self.thickness(seconds), self.effect.surface.hides), self.rank)
 
     def water(self, seconds: float) -> Float[Tensor, " n"]:
         """Water in kg/m^2, which is mm, at a second."""

@@ -20,6 +20,8 @@ from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import LEVEL, Exposure
 from pgsd_nerfstudio.response.haze_field import HazeField
+from pgsd_nerfstudio.response.layer import Layer
+from pgsd_nerfstudio.response.layer_making import layer_of
 from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -31,7 +33,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
 MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
-_REVISION = 3  # of the computation; stored answers of another revision are not used
+_REVISION = 4  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -51,7 +53,7 @@ def answer_of(
         OSError: the cache could not be written.
     """
     # The file holds only the results of rays, so its key holds only the inputs of the rays.
-    parts = (effect.emission, effect.material, effect.wind, effect.ambience)
+    parts = (effect.emission, effect.material, effect.wind, effect.ambience, effect.surface.landing)
     key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, *parts, seed)
     path = cache_dir() / "answers" / f"{key}.safetensors"
     answer = stored_answer(path, scene, effect, seconds=seconds, seed=seed)
@@ -59,13 +61,14 @@ def answer_of(
         metric = to_metric(scene)
         exposure = Exposure.of(metric, surface, effect, seed=seed)
         softening = softening_of(metric, exposure, surface, effect)
-        answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed)
+        layer = layer_of(scene, metric, surface, effect, seed=seed)
+        answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed, layer=layer)
         save_answer(path, answer)
     return replace(answer, edits=edits)
 
 
 def save_answer(path: Path, answer: Answer) -> None:
-    """Store the exposure, the softening and the edits of an answer, for `stored_answer`.
+    """Store the exposure, the softening, the layer and the edits of an answer, for `stored_answer`.
 
     Raises:
         OSError: the file could not be written.
@@ -73,6 +76,8 @@ def save_answer(path: Path, answer: Answer) -> None:
     tensors = {f.name: getattr(answer.exposure, f.name) for f in fields(Exposure)}
     if answer.softening is not None:
         tensors["softening"] = answer.softening
+    if answer.layer is not None:
+        tensors |= {f"layer.{name}": tensor for name, tensor in answer.layer.tensors.items()}
     if answer.edits is not None:
         tensors |= {f"edited.{name}": tensor for name, tensor in answer.edits.tensors.items()}
     save_tensors(path, tensors, {"revision": _REVISION})
@@ -96,11 +101,24 @@ def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, s
         return None
     tensors = stored[0]
     softening = tensors.pop("softening", None)
-    edited = {name.removeprefix("edited."): tensors.pop(name) for name in list(tensors) if name.startswith("edited.")}
+    edited, lying = _taken(tensors, "edited."), _taken(tensors, "layer.")
     if set(tensors) != {f.name for f in fields(Exposure)} or len(tensors["sky"]) != len(scene.gaussians):
         return None
-    edits = Edits(**edited) if edited else None
-    return composed(scene, effect, Exposure(**tensors), softening, seconds=seconds, seed=seed, edits=edits)
+    return composed(
+        scene,
+        effect,
+        Exposure(**tensors),
+        softening,
+        seconds=seconds,
+        seed=seed,
+        edits=Edits(**edited) if edited else None,
+        layer=Layer(**lying, frame=scene.frame) if lying else None,
+    )
+
+
+def _taken(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Take the tensors whose name has a prefix out of a dictionary; their names without it."""
+    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
 
 def composed(
@@ -112,6 +130,7 @@ def composed(
     seconds: float = 10.0,
     seed: int = 0,
     edits: Edits | None = None,
+    layer: Layer | None = None,
 ) -> Answer:
     """The answer from the results of rays; haze and coating follow from the effect.
 
@@ -123,6 +142,7 @@ def composed(
         seconds: second at which the edits are reached in full.
         seed: of patches and the variation of the cover.
         edits: change by edited pictures.
+        layer: cover on the surface of the scene.
     """
     return Answer(
         effect=effect,
@@ -133,6 +153,7 @@ def composed(
         metres_per_unit=scene.frame.metres_per_unit,
         haze=HazeField.of(effect, scene.frame, domain_of(scene), seed=seed),
         edits=edits,
+        layer=layer,
         seconds=seconds,
     )
 
