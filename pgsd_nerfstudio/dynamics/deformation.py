@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.encodings import WIDTH, fourier, sinusoidal
 from pgsd_nerfstudio.dynamics.field import LOOK, ActiveDelta, StateNet, within
+from pgsd_nerfstudio.dynamics.in_sight import Eye
 from pgsd_nerfstudio.dynamics.look import LOG_SCALE_BOUND, Change, LearnedLook, accumulate, changed
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
@@ -149,7 +150,8 @@ class DeformedCloud(GaussianSequence):
     def refresh(self, progress: Progress | None = None) -> None:
         """Does nothing: without recurrence no state has to be kept."""
 
-    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutFrame:
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook, eye: Eye | None = None) -> RolloutFrame:
+        """Every Gaussian of the cloud is shown to every camera."""
         return self._rendered(frame, self._deformed(frame, visible, look), None, look)
 
     def _clip(

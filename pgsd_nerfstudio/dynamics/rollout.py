@@ -19,10 +19,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
+from pgsd_nerfstudio.dynamics.in_sight import Extents, Eye, fading_in, in_sight
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_frame
 from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
-from pgsd_nerfstudio.dynamics.state import Deltas, RolloutState, advance, fading, simulated
+from pgsd_nerfstudio.dynamics.state import Deltas, RolloutState, advance, fading, simulated, simulated_of
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -69,6 +70,7 @@ class Rollout(GaussianSequence):
         self._keyframes: dict[int, RolloutState] = {}
         self._stamp: tuple[int, ...] = ()
         self._last: RolloutState | None = None
+        self._initial_extents: Extents | None = None
 
     @property
     def stale(self) -> bool:
@@ -174,8 +176,19 @@ class Rollout(GaussianSequence):
         """Changes with every in-place update of a weight, also by an optimizer or by loading a state dict."""
         return tuple(number for part in self._modules().values() for p in part.parameters() for number in (id(p), p._version))
 
-    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutFrame:
-        return self._rendered(self._reach(frame, visible, look), look, None)
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook, eye: Eye | None = None) -> RolloutFrame:
+        if eye is None or visible is not None or not self.field.still() or self.history.device.type != "cpu":
+            return self._rendered(self._reach(frame, visible, look), look, None, eye)
+        chosen = in_sight(self.history, frame, self._extents(look), self.exposure, eye)
+        return self._rendered(simulated_of(self.history, frame, *chosen), look, None, eye)
+
+    def _extents(self, look: InitialLook) -> Extents:
+        """Sizes of the particles; those of the initial look are kept."""
+        if look is not self.look:
+            return Extents.of(look)
+        if self._initial_extents is None:
+            self._initial_extents = Extents.of(look)
+        return self._initial_extents
 
     def _reach(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutState:
         """The state at a frame, without gradient, from the kept state before it (of a first `refresh` if there is none yet)."""
@@ -214,15 +227,19 @@ class Rollout(GaussianSequence):
             state, _ = advance(state, few, look, self.field, None, self._flow)
         return replace(state, active=active, collided=kept.collided, collided_change=kept.collided_change)
 
-    def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None) -> RolloutFrame:
+    def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None, eye: Eye | None = None) -> RolloutFrame:
         history = self.history
         fade = fading(history, state.frame, state.active)
         offset = state.offset * fade[:, None]
         active = changed(look.active.select(state.active), state.active_change.times(fade))
         collided = changed(look.collided_at(history, state.frame, state.collided), state.collided_change)
+        places = history.positions_at(state.frame, state.active) + offset
+        if eye is not None:
+            near = fading_in(places, history.reaches[state.active], torch.from_numpy(eye.center).to(places))
+            active = ParticleLook(active.opacity * near, active.scales, active.rgb)
         looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(active), _fields(collided), strict=True)))
         gaussians = Gaussians(
-            torch.cat([history.positions_at(state.frame, state.active) + offset, history.rest_positions[state.collided]]),
+            torch.cat([places, history.rest_positions[state.collided]]),
             torch.cat([state.quats, history.rest_quats[state.collided]]),
             looks.scales,
             looks.opacity,

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from pgsd_nerfstudio.dynamics.in_sight import Eye
 from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_finite, check_frame, check_window
 from pgsd_nerfstudio.effects.appearance import InitialLook
@@ -54,18 +55,20 @@ class GaussianSequence(ABC):
         """
 
     @torch.no_grad()
-    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None) -> Gaussians:
+    def gaussians(self, frame: int, visible: Bool[Tensor, " p"] | None = None, eye: Eye | None = None) -> Gaussians:
         """The Gaussians of any frame, without gradient; neighbouring frames in ascending order are cheapest.
 
         Args:
             frame: number of the frame.
             visible: mask over all particles; only these are evaluated. None means all.
+            eye: the camera that will see them: particles within its reach, faded in; what it cannot show may be missing. None:
+                all of them.
 
         Raises:
             IndexError: there is no such frame.
         """
         check_frame(frame, len(self))
-        return self._at(frame, visible, self._present_look()).gaussians
+        return self._at(frame, visible, self._present_look(), eye).gaussians
 
     @torch.no_grad()
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[RolloutFrame]:
@@ -113,8 +116,8 @@ class GaussianSequence(ABC):
         return clip
 
     @abstractmethod
-    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutFrame:
-        """One frame that exists, without gradient, of particles with this (learned) look."""
+    def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook, eye: Eye | None = None) -> RolloutFrame:
+        """One frame that exists, without gradient, of particles with this (learned) look, for a camera or for all."""
 
     @abstractmethod
     def _clip(

@@ -83,7 +83,11 @@ class Deltas(NamedTuple):
 
 def simulated(history: ParticleHistory, frame: int, visible: Bool[Tensor, " p"] | None = None) -> RolloutState:
     """The state in which nothing has been learned: simulated positions, initial look."""
-    active, collided = _seen(history.active(frame), visible), _seen(history.resting(frame), visible)
+    return simulated_of(history, frame, _seen(history.active(frame), visible), _seen(history.resting(frame), visible))
+
+
+def simulated_of(history: ParticleHistory, frame: int, active: Int[Tensor, " n"], collided: Int[Tensor, " m"]) -> RolloutState:
+    """`simulated` of chosen particles: ids of some that are active at the frame and of some that are collided, ascending."""
     like = history.positions
     return RolloutState(
         frame,

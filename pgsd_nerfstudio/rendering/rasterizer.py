@@ -93,6 +93,7 @@ class Rasterizer(Protocol):
     """Renders one frozen scene, and dynamic Gaussians in it."""
 
     frozen: Gaussians
+    config: RasterConfig
 
     @property
     def memory(self) -> str:

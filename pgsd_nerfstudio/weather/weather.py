@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
+from pgsd_nerfstudio.dynamics.in_sight import Eye
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
 from pgsd_nerfstudio.effects import Effect, InitialLook, initial_look
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -95,14 +96,23 @@ class Weather:
         """
         return self.sequence.gaussians(self.frame_at(second)).means
 
-    def gaussians(self, frame: int) -> Gaussians:
+    def gaussians(self, frame: int, camera: Cameras | None = None) -> Gaussians:
         """The particles of a frame as Gaussians in scene units with plain RGB: the active ones, then the collided ones.
+
+        Args:
+            frame: number of the frame.
+            camera: one camera in scene units that will see them: those within its reach, and what lies behind or beside it may
+                be missing. None: all particles.
 
         Raises:
             IndexError: there is no such frame.
+            ValueError: there is not exactly one camera.
         """
+        place, eye = self.scene.frame, None
+        if camera is not None:
+            eye = Eye.of(place.cameras_to_metric(camera), self.prepared.rasterizer.config, place.metres_per_unit)
         with torch.no_grad():
-            return self.scene.frame.gaussians_to_scene(self.sequence.gaussians(frame))
+            return place.gaussians_to_scene(self.sequence.gaussians(frame, eye=eye))
 
     def moment(self, frame: int) -> Shown | None:
         """The answer of the frozen scene at a frame; None where it still looks as it was trained."""
@@ -127,7 +137,7 @@ class Weather:
             IndexError: there is no such frame.
             ValueError: there is not exactly one camera.
         """
-        return picture_of(self.prepared, camera, self.gaussians(frame), self.moment(frame))
+        return picture_of(self.prepared, camera, self.gaussians(frame, camera), self.moment(frame))
 
     def render_clear(self, camera: Cameras) -> Picture:
         """What a camera sees of the scene without the weather, as it was trained.
@@ -213,4 +223,5 @@ class Weather:
         parts, frame = open_parts(Path(folder).expanduser(), prepared.scene)
         prepared = replace(prepared, scene=replace(prepared.scene, frame=frame))
         history, answer = parts.history.to(prepared.device), parts.answer.to(prepared.device)
+        answer = answer.beside(history.about.get("sharpness"))
         return Weather(prepared, parts.effect, parts.options, history, answer)
