@@ -1,8 +1,8 @@
 """Which particles of a frame a camera can show: what lies behind or beside it need not become Gaussians.
 
 A particle is kept if a ball around it touches the picture, by the rule with which the projection leaves out what is out of
-sight and with a pixel to spare; so leaving it out changes no picture. The ball's standard deviation is the particle's largest one
-plus the way that it makes while the shutter is open.
+sight and with a pixel to spare; so leaving it out changes no picture. The ball's standard deviation is the largest one of the
+particle plus the way that it makes while the shutter is open.
 """
 
 from __future__ import annotations
