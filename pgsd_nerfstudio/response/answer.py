@@ -26,7 +26,7 @@ from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.weather_light import in_weather
-from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, wet_share
+from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, under_water, wet_share
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
@@ -83,6 +83,15 @@ class Answer:
         """The answer of some of the Gaussians, by mask or by index."""
         layer = None if self.layer is None else self.layer.on(which, len(self.exposure.sky))
         return self._each(lambda tensor: tensor[which], layer=layer)
+
+    def beside(self, sharpness: float | None) -> Answer:
+        """The same answer with a haze that leaves out what the particles of a simulation take (HazeField.beside).
+
+        Args:
+            sharpness: of the simulation.
+        """
+        haze = None if self.haze is None else self.haze.beside(self.effect, sharpness)
+        return replace(self, haze=haze, number=next(_numbers))
 
     def thicker(self, factor: float) -> Answer:
         """The same answer with the extinction of its haze multiplied by `factor`."""
@@ -237,7 +246,9 @@ class Shown:
             light = in_weather(light, effect.ambience, self.share, None if softening is None else softening[ids])
         if effect.surface.landing == "wets":
             wet = wet_share(light, self.wet[ids])
-            light = light if edited else darkened(light, wet)
+            if not edited:
+                light = darkened(light, wet)
+                light = light if self.puddles is None else under_water(light, self.puddles.share[ids].to(light) * wet[:, 0])
             if towards is not None and self.puddles is not None:
                 seen = towards, exposure.normals[ids], exposure.loose[ids]
                 mirror, kept = self.puddles.mirror(ids, *seen, wet[:, 0], self.share)

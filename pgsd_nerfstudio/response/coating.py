@@ -46,7 +46,14 @@ class Coating:
     effect: Effect
 
     @staticmethod
-    def of(effect: Effect, exposure: Exposure, metric: Float[Tensor, "n 3"], *, seed: int = 0) -> Coating:
+    def of(
+        effect: Effect,
+        exposure: Exposure,
+        metric: Float[Tensor, "n 3"],
+        *,
+        seed: int = 0,
+        most: Float[Tensor, " n"] | None = None,
+    ) -> Coating:
         """The coating of Gaussians under an effect.
 
         Args:
@@ -54,6 +61,7 @@ class Coating:
             exposure: of the same Gaussians.
             metric: their centres in metres.
             seed: of the variation from place to place.
+            most: greatest share of each that a cover can hide, as from `exposure.most_hidden`; None: all but of what is loose.
         """
         response = effect.surface
         rate = falling_mass(effect) * exposure.catches * _uneven(metric, seed)
@@ -66,7 +74,7 @@ class Coating:
         return Coating(
             thickness_rate=rate * holds * (response.accumulation_speedup / response.layer_density) if gathers else none,
             thickest=torch.where(steep, response.film, math.inf),
-            most=torch.where(exposure.loose, LOOSE_MOST, 1.0),
+            most=torch.where(exposure.loose, LOOSE_MOST, 1.0) if most is None else most,
             water_rate=rate if response.landing == "wets" else none,
             # Each leaf is hidden by itself; ground and walls in patches.
             rank=torch.where(exposure.loose, ranks(metric, seed, grain=1.0), ranks(metric, seed)),

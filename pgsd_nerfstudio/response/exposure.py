@@ -15,6 +15,7 @@ import numpy as np
 import roma
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
@@ -27,8 +28,11 @@ RAYS = 24  # per Gaussian for mass, and as many for the sky; their noise of a te
 NEAR = 0.08  # m; a Gaussian this close to the surface is part of it
 SUNK = 0.5  # m; Gaussians this far below a surface still belong to it, since those above let light through
 OFF = 0.03  # m; rays start this far off the surface, since captures are rough by as much
-LOOSE_CATCH = 0.4  # mass that leaves, blades and branches catch; on average they turn half of their area to the sky
-LOOSE_MOST = 0.7  # share of them that a cover can hide
+LOOSE_CATCH = 0.4  # mass that blades and branches catch; on average they turn half of their area to the sky
+LOOSE_MOST = 0.7  # share of them that a cover can hide, unless they are level
+LEAF, FAR_LEAF = 0.03, 0.012  # m, and share of the distance to a camera: a larger loose Gaussian is many leaves in a haze
+UPRIGHT = 0.45, 0.75  # height of a Gaussian relative to its length from which less of it, and none, holds a cover
+TALL = 0.02  # m; standard deviation along z below which a Gaussian is not upright, whatever its form
 LEVEL = 0.9  # level from which a Gaussian counts as part of a smooth surface
 UNEVEN = 0.3  # level of a Gaussian that is not flat
 FLAT = 0.5  # ratio of the thinnest to the middle axis below which a Gaussian is flat and has a normal
@@ -62,15 +66,43 @@ class Exposure:
         """
         generator = torch.Generator().manual_seed(seed)
         starts, normals, loose, level = _ground(metric, surface)
+        flat = _own_normals(metric)[1]
         ways, fluxes = arrivals(effect, RAYS, generator)
         catches = torch.zeros(len(metric))
         for way, flux in zip(ways, fluxes, strict=True):
-            facing = torch.where(loose, LOOSE_CATCH * way.norm(), -(normals @ way).clamp_max(0.0))
+            # A leaf or a far roof catches with either side; what is not flat turns every way.
+            away = torch.where(flat, (normals @ way).abs(), LOOSE_CATCH * way.norm())
+            facing = torch.where(loose, away, -(normals @ way).clamp_max(0.0))
             asked = (facing > 0).nonzero()[:, 0]
             facing[asked[blocked(surface, starts[asked], (-way / way.norm()).expand(len(asked), 3))]] = 0.0
             catches += flux * facing
         sky, _ = open_sky(starts, normals, surface, RAYS, generator)
         return Exposure(normals, loose, catches, level, sky)
+
+
+def most_hidden(metric: Gaussians, exposure: Exposure, centers: Float[Tensor, "c 3"] | None = None) -> Float[Tensor, " n"]:
+    """Greatest share of each Gaussian that a cover can hide, by its form.
+
+    Upright Gaussians show the sides of posts and walls, which stay bare. A large loose Gaussian stands for many leaves, and as
+    one white cloud it would look like steam.
+
+    Args:
+        metric: the frozen Gaussians in metres.
+        exposure: of these Gaussians.
+        centers: of the cameras in metres; None: all leaves are near.
+    """
+    axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
+    height = (axes[:, 2] * metric.scales).norm(dim=1)
+    low, high = UPRIGHT
+    upright = ((height / metric.scales.amax(1) - low) / (high - low)).clamp(0, 1) * (height > TALL)
+    level = exposure.normals[:, 2].clamp(0, 1) ** 4 * _own_normals(metric)[1]
+    leaf = torch.full_like(height, LEAF)
+    if centers is not None:
+        apart, _ = KDTree(centers.numpy(force=True)).query(metric.means.numpy(force=True))
+        leaf = torch.maximum(leaf, FAR_LEAF * torch.from_numpy(apart).to(leaf))
+    leaves = (leaf / metric.scales.median(1).values).clamp_max(1.0)
+    loose = LOOSE_MOST * leaves + (1 - LOOSE_MOST * leaves) * level
+    return torch.where(exposure.loose, loose, 1 - upright)
 
 
 def arrivals(effect: Effect, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "r 3"], Float[Tensor, " r"]]:
@@ -112,11 +144,7 @@ def _ground(
     found = surface.closest(metric.means)
     sunk, buried, above = _beneath(metric.means, surface)
     loose = ~(found.distance < NEAR) & ~sunk & ~buried
-    order = metric.scales.sort(dim=1)
-    axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
-    own = axes.gather(2, order.indices[:, :1, None].expand(-1, 3, 1))[:, :, 0]
-    own = own * torch.where(own[:, 2:] < 0, -1.0, 1.0)
-    flat = order.values[:, 0] < FLAT * order.values[:, 1]
+    own, flat = _own_normals(metric)
     apart = torch.where(flat[:, None], own, up)
     normals = torch.where(loose[:, None], apart, torch.where(buried[:, None], up, found.normals))
     starts = torch.where(loose[:, None], metric.means + OFF * up, found.points + OFF * found.normals)
@@ -144,3 +172,11 @@ def _beneath(
     sunk = under & (hits.distance < SUNK)
     buried = under & ~sunk & torch.isinf(surface.cast(points, -up).distance)
     return sunk, buried, points + torch.where(under, hits.distance, 0.0)[:, None] * up
+
+
+def _own_normals(metric: Gaussians) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
+    """The direction of each Gaussian's thinnest axis, turned upwards, and whether it is flat."""
+    order = metric.scales.sort(dim=1)
+    axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
+    own = axes.gather(2, order.indices[:, :1, None].expand(-1, 3, 1))[:, :, 0]
+    return own * torch.where(own[:, 2:] < 0, -1.0, 1.0), order.values[:, 0] < FLAT * order.values[:, 1]

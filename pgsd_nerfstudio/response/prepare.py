@@ -18,7 +18,7 @@ from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
 from pgsd_nerfstudio.response.edits import Edits
-from pgsd_nerfstudio.response.exposure import LEVEL, Exposure
+from pgsd_nerfstudio.response.exposure import LEVEL, Exposure, most_hidden
 from pgsd_nerfstudio.response.haze_field import HazeField
 from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.layer_making import layer_of
@@ -33,7 +33,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
 MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
-_REVISION = 4  # of the computation; stored answers of another revision are not used
+_REVISION = 5  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -144,10 +144,11 @@ def composed(
         edits: change by edited pictures.
         layer: cover on the surface of the scene.
     """
+    metric, centers = to_metric(scene), scene.frame.to_metric(scene.cameras.centers)
     return Answer(
         effect=effect,
         exposure=exposure,
-        coating=Coating.of(effect, exposure, scene.frame.to_metric(scene.gaussians.means), seed=seed),
+        coating=Coating.of(effect, exposure, metric.means, seed=seed, most=most_hidden(metric, exposure, centers)),
         softening=softening,
         up=scene.frame.rotation,
         metres_per_unit=scene.frame.metres_per_unit,
