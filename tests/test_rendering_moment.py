@@ -29,6 +29,9 @@ class Dusk:
         red = torch.tensor([1.0, 0.0, 0.0]).to(rgb)
         return torch.where((ids % 2 == 0)[:, None], torch.lerp(rgb, red, self.strength), rgb)
 
+    def adds(self, view: Viewpoint) -> None:
+        return None
+
     def moving_colors(self, rgb, means, view: Viewpoint):
         return rgb * torch.exp(-0.2 * self.strength * (means - view.center.to(means)).norm(dim=1, keepdim=True))
 

@@ -62,7 +62,8 @@ class SurfaceResponse:
     """Thickness in metres that stays on any slope, however steep."""
     accumulation_speedup: float = 800.0
     """Time lapse of the cover: a collided particle stands for this many times its own water and that of the real particles it
-    represents. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours."""
+    represents. 10 s of moderate snow would leave 0.04 mm; with 800 they leave 3 cm, the cover of two hours. Where particles
+    wet, it is the time lapse of the water that runs off and stands in puddles."""
     layer_density: float = 100.0
     """Density of fresh cover in kg/m^3; 100 makes 1 cm of snow from 1 mm of water."""
     layer_thickness: float = 0.010
@@ -72,6 +73,20 @@ class SurfaceResponse:
     """Thickness in metres of a cover that hides 63 % of the surface below it."""
     darkens: float = 0.03
     """Water in mm (kg/m^2) that makes 63 % of a dry surface look wet. Pores take up about 0.1 mm, and more changes nothing."""
+    puddles: bool = True
+    """Whether water that wets runs off and stands where the ground is level or hollow."""
+    unevenness: float = 0.003
+    """Standard deviation in metres of the height of level ground below what its mesh resolves. Paving is laid to about a
+    centimetre in four metres, and puddles form in what is left."""
+    ripples: bool = True
+    """Whether drops make rings on standing water."""
+    mirror: bool = True
+    """Whether wet and standing surfaces mirror the scene; False: the even sky alone."""
+    sheen: float = 2.5
+    """Factor on the light that wet and standing surfaces mirror. 1 is Fresnel's law; more shows at first sight what is water,
+    also where it mirrors dark walls."""
+    drips: bool = True
+    """Whether water gathers and drips from the edges of what stands above the ground, such as tables and benches."""
     splash: Splash | None = None
     """Droplets of an impact; None: there are none."""
 
@@ -83,3 +98,7 @@ class SurfaceResponse:
         for name in ("accumulation_speedup", "layer_density", "layer_thickness", "hides", "darkens"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
+        if not self.sheen >= 0:
+            raise ValueError(f"sheen must not be negative, got {self.sheen:g}")
+        if not self.unevenness >= 0:
+            raise ValueError(f"unevenness must not be negative, got {self.unevenness:g} m")

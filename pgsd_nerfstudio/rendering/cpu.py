@@ -14,7 +14,7 @@ from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
-from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame
+from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.walk import blend_at_once, blend_backward, blend_merged
@@ -76,7 +76,8 @@ class CpuRasterizer:
             raise ValueError("the cameras' viewmats and Ks must be finite, found NaN or infinite values")
         at = moment_per_frame(moments, len(cameras))
         frames = []
-        for k, (moving, moment) in enumerate(zip(dynamic_per_frame(dynamic, len(cameras)), at, strict=True)):
+        sets = with_added(dynamic_per_frame(dynamic, len(cameras)), at, cameras)
+        for k, (moving, moment) in enumerate(zip(sets, at, strict=True)):
             # The backward pass walks over the frozen list once more, which a view that is blended alone makes shorter.
             once = moving is not None and not (
                 torch.is_grad_enabled() and any(tensor.requires_grad for tensor in moving.tensors.values())

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
 from pgsd_nerfstudio.rendering.isects import Isects, merge
-from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
+from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.motion_blur import footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
@@ -101,7 +101,7 @@ class GsplatRasterizer:
     ) -> Rendering:
         """As `Rasterizer.render`."""
         at = moment_per_frame(moments, len(cameras))
-        moving = dynamic_per_frame(dynamic, len(cameras))
+        moving = with_added(dynamic_per_frame(dynamic, len(cameras)), at, cameras)
         clip = torch.stack([self._frame(cameras, k, moving[k], at[k]) for k in range(len(cameras))])
         behind = backgrounds(background, cameras, at, clip)
         return composite(clip[..., :3], clip[..., 3], clip[..., 4], behind)

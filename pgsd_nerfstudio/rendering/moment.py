@@ -7,6 +7,7 @@ mirrors the sky, fog fades by distance); it changes a Gaussian's opacity, scales
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -14,7 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgsd_nerfstudio.scene.cameras import Cameras
-from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
+from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class Viewpoint(NamedTuple):
@@ -76,6 +78,15 @@ class Moment(Protocol):
         """
         ...
 
+    def adds(self, view: Viewpoint) -> Gaussians | None:
+        """Gaussians of the moment itself that only this view needs, with plain RGB as it leaves them; they are drawn with the
+        dynamic ones. None: there are none.
+
+        Args:
+            view: the camera.
+        """
+        ...
+
     def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
         """The background as a camera sees it, [3] or [h, w, 3].
 
@@ -101,6 +112,29 @@ def moment_per_frame(moments: Moments, frames: int) -> list[Moment | None]:
     if len(moments) != frames:
         raise ValueError(f"expected one moment for each of the {frames} cameras, found {len(moments)}; one serves all")
     return list(moments)
+
+
+def with_added(
+    moving: Sequence[Gaussians | None], moments: Sequence[Moment | None], cameras: Cameras
+) -> list[Gaussians | None]:
+    """The dynamic Gaussians of each frame, and those that the moment of the frame adds for its camera.
+
+    Args:
+        moving: one set for each frame, or None.
+        moments: one for each frame, or None.
+        cameras: one for each frame.
+    """
+    frames = []
+    for k, (one, moment) in enumerate(zip(moving, moments, strict=True)):
+        with torch.no_grad():
+            added = None if moment is None else moment.adds(Viewpoint.of(cameras, k, torch.zeros(1)))
+        if one is not None and added is not None:
+            colors = view_colors(one.colors, one.means, cameras.viewmats[k].to(one.means))
+            own = replace(added.to(one.means), antialiased=one.antialiased, whole=one.whole)
+            frames.append(concatenate([replace(one, colors=colors), own]))
+        else:
+            frames.append(added if one is None else one)
+    return frames
 
 
 def backgrounds(

@@ -190,7 +190,8 @@ def _render_frame(
     view = Viewpoint.of(cameras, k, sets[0].means)
     viewmat, K = view.viewmat, view.K
     if moment is not None:
-        sets = [moment.altered(sets[0]), *sets[1:]]
+        added = moment.adds(view)
+        sets = [moment.altered(sets[0]), *sets[1:], *([] if added is None else [added.to(sets[0].means)])]
     parts = [project_reference(one, viewmat, K, cameras.width, cameras.height, config, missed) for one in sets]
     projection = Projection(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
     seen = [view_colors(one.colors, one.means, viewmat) for one in sets]

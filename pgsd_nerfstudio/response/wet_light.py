@@ -1,4 +1,9 @@
-"""The light of wet frozen Gaussians: water darkens their own light and mirrors the sky."""
+"""The light of wet frozen Gaussians: water darkens their own light and mirrors the sky.
+
+Under a level surface of water a diffuse ground is darker still: light that it sends up too flatly comes back to it (Angstrom,
+"The albedo of various surfaces of ground", Geografiska Annaler 7, 1925; Lekner & Dorf, "Why some things are darker when wet",
+Applied Optics 27, 1988).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +16,7 @@ from pgsd_nerfstudio.response.light import leafy, mirrored, wetted
 
 WAXEN = 0.75  # share of a wet look that leaves do not take on
 SMOOTH = 0.45  # light that wet level ground mirrors, relative to a level film of water
+ENTERS, KEPT = 0.934, 0.477  # diffuse light that enters water (n = 1.333), and that its surface sends back to the ground
 
 
 def wet_share(light: Float[Tensor, "m 3"], wet: Float[Tensor, " m"]) -> Float[Tensor, "m 1"]:
@@ -21,6 +27,17 @@ def wet_share(light: Float[Tensor, "m 3"], wet: Float[Tensor, " m"]) -> Float[Te
 def darkened(light: Float[Tensor, "m 3"], share: Float[Tensor, "m 1"]) -> Float[Tensor, "m 3"]:
     """Linear light of Gaussians that have a share of a wet look, without what they mirror."""
     return torch.lerp(light, wetted(light), share)
+
+
+def under_water(light: Float[Tensor, "m 3"], share: Float[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+    """Linear light of ground of which a share lies under standing water, without what the water mirrors (Angstrom 1925).
+
+    Args:
+        light: of the wet ground, under white light of 1.
+        share: 0..1.
+    """
+    albedo = light.clamp(0.0, 1.0)
+    return torch.lerp(light, ENTERS * (1 - KEPT) * albedo / (1 - KEPT * albedo), share[:, None].to(light))
 
 
 def mirrored_sky(

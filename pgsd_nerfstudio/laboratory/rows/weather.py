@@ -129,6 +129,9 @@ class _Air:
     def frozen_colors(self, rgb: Tensor, means: Tensor, ids: Tensor, view: Viewpoint) -> Tensor:
         return self.moving_colors(rgb, means, view)
 
+    def adds(self, view: Viewpoint) -> None:
+        return None
+
     def moving_colors(self, rgb: Tensor, means: Tensor, view: Viewpoint) -> Tensor:
         return self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
 

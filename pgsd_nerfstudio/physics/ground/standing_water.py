@@ -1,10 +1,10 @@
 """Standing water: rain that runs off over the ground, gathers in its hollows, fills them and spills into the next.
 
-The ground is a map of heights seen from above. Hollows and the way of the water follow from a flood of the map from its outlets
-upward, lowest cell first (priority-flood: Barnes, Lehman & Mulla, "Priority-flood: An optimal depression-filling and
-watershed-labeling algorithm for digital elevation models", 2014). A cell gives its water to the cell from which the flood reached
-it, so all of it ends in a hollow or at an outlet. A full hollow hands on what more it gets. At any time the water that has
-fallen is in the film, in the hollows or has run off; nothing else takes any.
+The ground is a map of heights seen from above, or from below what stands on it. Hollows and the way of the water follow from a
+flood of the map from its outlets upward, lowest cell first (priority-flood: Barnes, Lehman & Mulla, "Priority-flood: An optimal
+depression-filling and watershed-labeling algorithm for digital elevation models", 2014). A cell gives its water to the cell
+from which the flood reached it, so all of it ends in a hollow or at an outlet. A full hollow hands on what more it gets. At any
+time the water that has fallen is in the film, in the hollows or has run off; nothing else takes any.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy import ndimage
 
@@ -27,6 +27,7 @@ MAX_CELLS = 400_000  # of the map; larger grounds have larger cells
 DEEPEST = 0.012  # m; deeper hollows drain above this depth, into soil, joints or a gully
 SMOOTHED = 0.09  # m; standard deviation over which the roughness of a scanned mesh is averaged
 MENDED = (0.27, 0.12, 0.1)  # m, m, m^2: width of the median that takes dents out of a mesh, deepest dent, largest hole
+UNDER = 0.3  # m above the ground's plane from where ground is looked for below tables and roofs
 LEVELLED = (0.15, 0.10, 0.06, 0.04, 0.03, 0.03)  # m around the ground within which heights tell its plane, round by round
 TILTED = 2.5  # degrees by which a capture's up may be wrong
 SAME = 0.04  # m; greatest difference in height of neighbouring cells of one surface
@@ -66,6 +67,8 @@ class StandingWater:
     """Height of each cell above the plane that counts as level, m; NaN where there is no surface."""
     level: Float[ndarray, "3"]
     """That plane: its height in metres at the origin, and its rise along x and y."""
+    area: float
+    """m^2 of ground that rain falls on."""
     basin: Int[ndarray, "x y"]
     """Number of the hollow that a cell is part of, -1 for none."""
     catchment: Float[ndarray, " b"]
@@ -91,17 +94,22 @@ class StandingWater:
         x, y = (lower[k] + cell * np.arange(shape[k]) for k in range(2))
         at = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         top = domain.upper[2]
-        origins = np.concatenate([at, np.full((len(at), 1), top)], 1).astype(np.float32)
-        distance = surface.cast(origins, np.broadcast_to(np.float32([0, 0, -1]), origins.shape).copy()).distance.numpy()
-        ground = np.where(np.isfinite(distance), top - distance.astype(np.float64), np.nan).reshape(shape)
-        level = _level(at, ground.reshape(-1))
+        ground = _below(surface, at, np.full(len(at), top))
+        level = _level(at, ground)
+        sheltered = _below(surface, at, level[0] + at @ level[1:] + UNDER)
+        roofed = (ground > level[0] + at @ level[1:] + 1.5 * UNDER) & np.isfinite(sheltered)
+        ground = np.where(roofed, sheltered, ground).reshape(shape)
         plane = (level[0] + at @ level[1:]).reshape(shape)
         ground = _smoothed(_mended(ground - plane, cell), SMOOTHED / cell) + unevenness * _uneven(at, seed).reshape(shape)
-        return StandingWater.on(ground, lower, cell, level)
+        return StandingWater.on(ground, lower, cell, level, ~roofed.reshape(shape))
 
     @staticmethod
     def on(
-        ground: Float[ndarray, "x y"], lower: Float[ndarray, "2"], cell: float, level: Float[ndarray, "3"] | None = None
+        ground: Float[ndarray, "x y"],
+        lower: Float[ndarray, "2"],
+        cell: float,
+        level: Float[ndarray, "3"] | None = None,
+        under_sky: Bool[ndarray, "x y"] | None = None,
     ) -> StandingWater:
         """The hollows of a map of heights.
 
@@ -110,6 +118,7 @@ class StandingWater:
             lower: centre of the first cell, m.
             cell: edge of a cell, m.
             level: the plane above which the heights are; None: z = 0.
+            under_sky: cells that rain falls on; None: all.
         """
         known = np.isfinite(ground)
         heights = np.where(known, ground, -np.inf)
@@ -124,17 +133,14 @@ class StandingWater:
             drains[tuple(lowest.T)] = heights[tuple(lowest.T)] + DEEPEST
             filled, parent, order = _flood(heights, drains)
         basin, count = _basins(known & (filled > heights), filled, cell, order)
-        into, catchment = _ways(basin.reshape(-1), parent, order, known.reshape(-1), count)
+        rained_on = known if under_sky is None else known & under_sky
+        into, catchment = _ways(basin.reshape(-1), parent, order, rained_on.reshape(-1), count)
         brims = np.zeros(count)
         held = basin >= 0
         brims[basin[held]] = filled[held]
         level = np.zeros(3) if level is None else level
-        return StandingWater(lower, cell, ground, level, basin, catchment * cell**2, into, brims)
-
-    @property
-    def area(self) -> float:
-        """m^2 of ground that rain falls on."""
-        return float(np.isfinite(self.ground).sum()) * self.cell**2
+        area = float(rained_on.sum()) * cell**2
+        return StandingWater(lower, cell, ground, level, area, basin, catchment * cell**2, into, brims)
 
     def after(self, fallen: float) -> Pools:
         """The water after rain.
@@ -227,6 +233,14 @@ def depth_over(pools: Pools, basin: Int[ndarray, " n"], floor: Float[ndarray, " 
         return np.full(len(basin), -1.0)
     wet = (basin >= 0) & (pools.volumes[basin] > 0)
     return np.where(wet, pools.levels[basin] - floor, -1.0)
+
+
+def _below(surface: SurfaceMesh, at: Float[ndarray, "n 2"], start: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
+    """Height of the first surface below places and heights, m; NaN where there is none or where its underside is met."""
+    origins = np.concatenate([at, start[:, None]], 1).astype(np.float32)
+    hits = surface.cast(origins, np.broadcast_to(np.float32([0, 0, -1]), origins.shape).copy())
+    distance, upward = hits.distance.numpy().astype(np.float64), hits.normal.numpy()[:, 2] > 0
+    return np.where(np.isfinite(distance) & upward, start - distance, np.nan)
 
 
 def _level(at: Float[ndarray, "n 2"], heights: Float[ndarray, " n"]) -> Float[ndarray, "3"]:
@@ -326,8 +340,8 @@ def _flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray
     """Flood a map from its border, from unknown cells (-inf) and from drains upward.
 
     Returns:
-        The filled heights; the cell, as a flat index, from which the flood reached each cell, -1 for an outlet; and all cells in
-        the order in which the flood left them.
+        The filled heights; the cell, as a flat index, from which the flood reached each cell, -1 for an outlet; and all cells
+        in the order in which the flood left them.
     """
     nx, ny = heights.shape
     n = nx * ny
@@ -402,7 +416,7 @@ def _pop(heights: ndarray, cells: ndarray, size: int) -> int:
 
 
 @numba.njit(cache=True)
-def _ways(basin: ndarray, parent: ndarray, order: ndarray, known: ndarray, count: int) -> tuple[ndarray, ndarray]:
+def _ways(basin: ndarray, parent: ndarray, order: ndarray, rained_on: ndarray, count: int) -> tuple[ndarray, ndarray]:
     """The hollow that each hollow spills into, and the number of cells whose water comes to each first."""
     n = len(order)
     first = np.full(n, -1, np.int64)  # hollow that a cell's water comes to first
@@ -415,6 +429,6 @@ def _ways(basin: ndarray, parent: ndarray, order: ndarray, known: ndarray, count
         first[at] = own if own >= 0 else below
         if own >= 0 and below != own:
             into[own] = below
-        if known[at] and first[at] >= 0:
+        if rained_on[at] and first[at] >= 0:
             catchment[first[at]] += 1.0
     return into, catchment

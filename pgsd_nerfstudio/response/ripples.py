@@ -1,0 +1,188 @@
+"""Ripples on standing water: the rings of the drops that fell into it, which spread and fade (physics.laws.water_waves)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from pgsd_nerfstudio.effects.matter import Material
+from pgsd_nerfstudio.physics.bodies import SPLASHED
+from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
+from pgsd_nerfstudio.physics.laws.water_waves import Ring, crater_depth
+from pgsd_nerfstudio.physics.record.history import ParticleHistory
+
+SPREADS = (0.0018, 0.0030, 0.0048)  # m; craters of the tables
+CRATER = 1.3  # spread of a crater relative to the diameter of its drop
+WAVES = 0.05  # share of an impact's energy that goes into waves; a drop leaves most of it to the splash
+DEPTH = 0.006  # m, of the water of all rings
+SECONDS, RADIUS, DT, DR = 0.7, 0.3, 0.0015, 0.0015  # length, reach and steps of the tables
+NEAR_GROUND = 0.03  # m; a drop that ends so near to the ground of a hollow has fallen into it
+COPIES = 6  # rings of one simulated drop at most, which stands for many
+APART = 0.35  # m around it in which the others that it stands for fall
+STEEPEST = 0.5  # slope that linear waves do not exceed here
+BIN = 0.12  # m; edge of the squares by which points near a ring are found
+
+
+@dataclass(frozen=True, eq=False)
+class Ripples:
+    """The rings of i impacts, in the order of time."""
+
+    times: Float[ndarray, " i"]
+    """Seconds from the beginning of the weather."""
+    places: Float[ndarray, "i 2"]
+    """Metres."""
+    depths: Float[ndarray, " i"]
+    """Of the craters, m."""
+    tables: Int[ndarray, " i"]
+    """Number of the table of each ring."""
+
+    @staticmethod
+    def of(history: ParticleHistory, water: StandingWater, material: Material) -> Ripples:
+        """The rings of the drops of a simulation that fell into hollows.
+
+        A drop falls while its last step lasts: as much of a frame as that step is long, relative to the step before. The other
+        real drops that it represents fall around it within the time of a frame.
+
+        Args:
+            history: of the drops.
+            water: the hollows.
+            material: gives the mass of a drop.
+        """
+        ends, births = history.ends.numpy(force=True).astype(np.int64), history.births.numpy(force=True)
+        last = history.offsets[1:].numpy(force=True) - 1
+        falls = (ends < history.frames) & ~history.collided.numpy(force=True) & (ends - births > 2)
+        falls &= (history.kinds.numpy(force=True) & SPLASHED) == 0
+        which = np.flatnonzero(falls)
+        positions = history.positions.numpy(force=True)
+        at = positions[last[which]].astype(float)
+        basin, floor = water.under(at[:, :2])
+        hits = (basin >= 0) & (np.abs(at[:, 2] - water.height(at[:, :2], floor)) < NEAR_GROUND)
+        which, at = which[hits], at[hits]
+        rows = last[which]
+        step = positions[rows - 1].astype(float) - positions[rows - 2]
+        length = np.linalg.norm(step, axis=1).clip(1e-9)
+        part = (np.linalg.norm(at - positions[rows - 1], axis=1) / length).clip(0, 1)
+        seconds = (ends[which] - 2 + part) / history.fps
+        diameters = history.diameters.numpy(force=True)[which].astype(float)
+        energy = 0.5 * np.asarray(material.mass(diameters)) * (length * history.fps) ** 2 * WAVES
+        copies = np.round(history.represents.numpy(force=True)[which]).astype(int).clip(1, COPIES)
+        own = np.repeat(np.arange(len(which)), copies)
+        rng = np.random.default_rng(0x0717)
+        other = np.append(False, own[1:] == own[:-1]) if len(own) else np.zeros(0, bool)
+        radius, turn = APART * np.sqrt(rng.random(len(own))), 2 * np.pi * rng.random(len(own))
+        moved = np.where(other, radius, 0.0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
+        spread = CRATER * diameters
+        table = np.abs(np.log(spread[:, None] / np.array(SPREADS))).argmin(1)
+        crater = crater_depth(energy, np.array(SPREADS)[table])
+        times = seconds[own] - np.where(other, rng.random(len(own)) / history.fps, 0.0)
+        order = np.argsort(times, kind="stable")
+        own = own[order]
+        return Ripples(times[order], (at[:, :2][own] + moved[order]), crater[own], table[own])
+
+    def active(self, seconds: float) -> tuple[int, int]:
+        """First and exclusive last number of the impacts whose rings move at a second."""
+        first, last = np.searchsorted(self.times, [seconds - SECONDS + DT, seconds])
+        return int(first), int(last)
+
+    def slopes(self, points: Float[ndarray, "n 2"], seconds: float) -> Float[ndarray, "n 2"]:
+        """Slopes of the water along x and y.
+
+        Args:
+            points: m.
+            seconds: since the beginning of the weather.
+        """
+        first, last = self.active(seconds)
+        result = np.zeros((len(points), 2))
+        if first == last or len(points) == 0:
+            return result
+        lower = points.min(0) - 1e-6
+        shape = np.floor((points.max(0) - lower) / BIN).astype(np.int64) + 1
+        bins = np.floor((points - lower) / BIN).astype(np.int64)
+        key = bins[:, 0] * shape[1] + bins[:, 1]
+        order = np.argsort(key, kind="stable")
+        starts = np.searchsorted(key[order], np.arange(shape[0] * shape[1] + 1))
+        ages = seconds - self.times[first:last]
+        rings = (self.places[first:last], ages, self.depths[first:last], self.tables[first:last])
+        found = _add(np.ascontiguousarray(points[order]), starts, lower, shape, *rings, _tables())
+        result[order] = found
+        size = np.hypot(*result.T)[:, None]
+        return result / np.maximum(1.0, size / STEEPEST)
+
+    @property
+    def count(self) -> int:
+        """Number of impacts."""
+        return len(self.times)
+
+
+@lru_cache(maxsize=1)
+def _tables() -> Float[ndarray, "k t r"]:
+    """Slopes of rings of craters of 1 m depth."""
+    size = {"seconds": SECONDS, "radius": RADIUS, "dt": DT, "dr": DR}
+    return np.stack([Ring.of(spread, DEPTH, **size).slopes for spread in SPREADS])
+
+
+@lru_cache(maxsize=1)
+def crests() -> tuple[Float[ndarray, "k t 2"], Float[ndarray, "k t 2"]]:
+    """Radii in metres of the steepest place of each ring and of that of the other sign beside it, and their slopes."""
+    tables = _tables()
+    radii = np.arange(tables.shape[2]) * DR
+    # What matters to the eye is the slope times the length of the crest's arc.
+    first = (np.abs(tables) * np.sqrt(radii)).argmax(2)
+    at = np.take_along_axis(tables, first[:, :, None], 2)[:, :, 0]
+    near = np.exp(-((radii - radii[first][:, :, None]) ** 2) / (2 * 0.012**2))
+    second = (np.maximum(-tables * np.sign(at)[:, :, None], 0) * near).argmax(2)
+    beside = np.take_along_axis(tables, second[:, :, None], 2)[:, :, 0]
+    return np.stack([radii[first], radii[second]], -1), np.stack([at, beside], -1)
+
+
+@numba.njit(cache=True)
+def _add(
+    points: ndarray, starts: ndarray, lower: ndarray, shape: ndarray,
+    places: ndarray, ages: ndarray, depths: ndarray, numbers: ndarray, tables: ndarray,
+) -> ndarray:  # fmt: skip
+    """Sum of the slopes of rings at points that are sorted by square; `starts` has the first point of each square."""
+    found = np.zeros((len(points), 2))
+    for i in range(len(places)):
+        when = ages[i] / DT
+        row = int(when)
+        if row + 1 >= tables.shape[1]:
+            continue
+        late = when - row
+        table = tables[numbers[i]]
+        reach = min(RADIUS, 0.05 + 0.45 * ages[i])  # capillary waves of these lengths are not faster
+        x, y = places[i]
+        left, right = math.floor((x - reach - lower[0]) / BIN), math.floor((x + reach - lower[0]) / BIN)
+        near, away = math.floor((y - reach - lower[1]) / BIN), math.floor((y + reach - lower[1]) / BIN)
+        for a in range(max(left, 0), min(right, shape[0] - 1) + 1):
+            begin, end = max(near, 0), min(away, shape[1] - 1)
+            if begin > end:
+                continue
+            for n in range(starts[a * shape[1] + begin], starts[a * shape[1] + end + 1]):
+                dx, dy = points[n, 0] - x, points[n, 1] - y
+                r = math.sqrt(dx * dx + dy * dy)
+                if r >= reach or r < 1e-4:
+                    continue
+                place = r / DR
+                column = int(place)
+                if column + 1 >= tables.shape[2]:
+                    continue
+                part = place - column
+                now = table[row, column] * (1 - part) + table[row, column + 1] * part
+                then = table[row + 1, column] * (1 - part) + table[row + 1, column + 1] * part
+                slope = depths[i] * (now * (1 - late) + then * late) / r
+                found[n, 0] += slope * dx
+                found[n, 1] += slope * dy
+    return found
+
+
+def tilted(slopes: Float[ndarray, "n 2"]) -> torch.Tensor:
+    """Unit normals [n, 3] of water of these slopes."""
+    normals = np.concatenate([-slopes, np.ones((len(slopes), 1))], 1)
+    return torch.from_numpy(normals / np.linalg.norm(normals, axis=1, keepdims=True)).float()
