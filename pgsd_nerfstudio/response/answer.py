@@ -25,6 +25,7 @@ from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.light import luminance
+from pgsd_nerfstudio.response.sky import EVEN, overcast, reach
 from pgsd_nerfstudio.response.weather_light import in_weather
 from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, under_water, wet_share
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
@@ -62,6 +63,8 @@ class Answer:
     """Second at which the edited pictures are reached in full."""
     puddles: Puddles | None = None
     """Water that stands, mirrors and ripples; None: wet surfaces mirror the even sky."""
+    sky: Float[Tensor, " n"] | None = None
+    """Share of each Gaussian that is sky, 0..1; None: none is."""
     layer: Layer | None = None
     """Cover that lies on the surface of the scene as Gaussians of its own; None: there is none."""
     number: int = field(default_factory=lambda: next(_numbers))
@@ -106,6 +109,7 @@ class Answer:
             coating=_mapped(self.coating, change),
             edits=None if self.edits is None else _mapped(self.edits, change),
             softening=None if self.softening is None else change(self.softening),
+            sky=None if self.sky is None else change(self.sky),
             puddles=None if self.puddles is None else self.puddles.each(change),
             number=next(_numbers),
             **others,
@@ -196,8 +200,19 @@ class Shown:
             ids: indices of these Gaussians in the scene as `altered` returns it.
             view: the camera.
         """
-        towards = torch.nn.functional.normalize(view.center - means, dim=1) @ self.answer.up.T.to(means)
+        along = torch.nn.functional.normalize(view.center - means, dim=1)
+        towards = along @ self.answer.up.T.to(means)
+        if self.answer.sky is not None and self.medium is not None:
+            distant = view.center - (reach(-towards[:, 2]) / self.answer.metres_per_unit)[:, None] * along
+            means = torch.where((self._sky(ids) > 0.5)[:, None], distant, means)
         return self.moving_colors(self.lit(rgb, ids, towards), means, view)
+
+    def _sky(self, ids: Int[Tensor, " m"]) -> Float[Tensor, " m"]:
+        """Share of sky of Gaussians of the scene as `altered` returns it."""
+        if self.answer.sky is None:
+            return torch.zeros(len(ids), device=ids.device)
+        total = len(self.answer.sky)
+        return torch.where(ids < total, self.answer.sky[ids.clamp_max(total - 1)], 0.0)
 
     def moving_colors(self, rgb: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], view: Viewpoint) -> Float[Tensor, "n 3"]:
         """Colours of particles as a view shows them through the haze; arguments as for `frozen_colors`."""
@@ -258,6 +273,10 @@ class Shown:
                 light = light + wet * mirrored_sky(exposure.normals[ids], exposure.level[ids], exposure.sky[ids], towards, sky)
         if edited:
             return light
+        if effect.ambience is not None and self.answer.sky is not None:
+            height = torch.full_like(light[:, 0], EVEN) if towards is None else -towards[:, 2]
+            clouded = (self.share * effect.ambience.clouds * self.answer.sky[ids, None]).to(light)
+            light = torch.lerp(light, overcast(height, effect.ambience.sky), clouded)
         cover = cover_light(light, effect.appearance.collided.rgb, exposure.sky[ids])
         return torch.lerp(light, cover, self.hidden[ids, None].to(light))
 

@@ -23,7 +23,9 @@ from pgsd_nerfstudio.response.haze_field import HazeField
 from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.layer_making import layer_of
 from pgsd_nerfstudio.response.light import luminance
+from pgsd_nerfstudio.response.sky import sky_share
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
+from pgsd_nerfstudio.scene.frame import attention
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
@@ -145,15 +147,19 @@ def composed(
         layer: cover on the surface of the scene.
     """
     metric, centers = to_metric(scene), scene.frame.to_metric(scene.cameras.centers)
+    _, radius = attention(scene.cameras, scene.gaussians)
+    sky = sky_share(metric, centers, radius * scene.frame.metres_per_unit)
+    below = replace(exposure, catches=exposure.catches * (1 - sky))  # nothing lies on the sky
     return Answer(
         effect=effect,
         exposure=exposure,
-        coating=Coating.of(effect, exposure, metric.means, seed=seed, most=most_hidden(metric, exposure, centers)),
+        coating=Coating.of(effect, below, metric.means, seed=seed, most=most_hidden(metric, exposure, centers)),
         softening=softening,
         up=scene.frame.rotation,
         metres_per_unit=scene.frame.metres_per_unit,
         haze=HazeField.of(effect, scene.frame, domain_of(scene), seed=seed),
         edits=edits,
+        sky=sky if bool((sky > 0).any()) else None,
         layer=layer,
         seconds=seconds,
     )
