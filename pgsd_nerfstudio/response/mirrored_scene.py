@@ -1,15 +1,13 @@
 """What a mirror in the scene shows: rays on the surface mesh in the colours of the frozen Gaussians, and what is far behind it.
 
 A vertex of the mesh has the light of the opaque Gaussians next to it. Where a ray meets no mesh, it sees the picture that all
-Gaussians make from a place in the open, or the sky: what is bright and above the horizon there, or covered by no Gaussian.
-Under the clouds of a weather, the sky is the CIE's overcast sky (Moon & Spencer, "Illumination from a non-uniform sky", 1942), as
-bright as it must be to light white ground as the weather does.
+Gaussians make from a place in the open, or the sky (`sky`): Gaussians that are sky, and directions that none covers.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,7 +18,7 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.display import linear
-from pgsd_nerfstudio.response.light import luminance
+from pgsd_nerfstudio.response.sky import overcast
 from pgsd_nerfstudio.response.weather_light import in_weather
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
@@ -31,10 +29,7 @@ WIDE, HIGH = 192, 48  # pixels of that picture, all around and from the horizon 
 NEIGHBOURS = 6  # Gaussians that colour a vertex
 NEAR = 0.03  # m, standard deviation of their weights
 OPAQUE = 0.3  # opacity from which a Gaussian colours the mesh
-SKY_LIGHT = (0.15, 0.45)  # linear luminance between which what is far counts more and more as sky
-SKY_HEIGHT = 0.05  # sine of the least height above the horizon of a sky
 UNDERSIDE = 0.35  # light of the underside of a surface relative to its upper side
-OVERCAST = 9 / 7  # light of the overcast sky's zenith relative to that of white level ground below it
 LIFT = 0.003  # m; rays start this far above the water
 
 
@@ -52,15 +47,16 @@ class MirroredScene:
     """Share of the sky in each of its pixels, 0..1."""
 
     @staticmethod
-    def of(metric: Gaussians, surface: SurfaceMesh, middle: Float[Tensor, "3"]) -> MirroredScene:
+    def of(metric: Gaussians, surface: SurfaceMesh, middle: Float[Tensor, "3"], sky: Float[Tensor, " n"]) -> MirroredScene:
         """The surroundings that a scene's mirrors show.
 
         Args:
             metric: the frozen Gaussians in metres, with plain RGB.
             surface: mesh of the scene, in metres.
             middle: place in the open from which what is far is seen, m.
+            sky: share of each Gaussian that is sky, 0..1.
         """
-        far, opened = _around(metric, middle)
+        far, opened = _around(metric, middle, sky)
         return MirroredScene(surface, _vertex_light(metric, surface), far, opened)
 
     def seen(
@@ -91,8 +87,7 @@ class MirroredScene:
             light[hit] = torch.where(under[:, None], UNDERSIDE * at, at)
             opened[hit] = 0.0
         if ambience is not None:
-            white = 2.0**ambience.stops * torch.tensor(ambience.tint)
-            sky = white * OVERCAST * (1 + 2 * directions[:, 2:].clamp_min(0.0)) / 3
+            sky = overcast(directions[:, 2], ambience.sky)
             light = torch.lerp(in_weather(light, ambience, share, None), sky, share * opened[:, None])
         return light.to(device)
 
@@ -119,7 +114,9 @@ def _vertex_light(metric: Gaussians, surface: SurfaceMesh) -> Float[Tensor, "v 3
     return (weights[:, :, None] * light).sum(1) / weights.sum(1, keepdim=True)
 
 
-def _around(metric: Gaussians, middle: Float[Tensor, "3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+def _around(
+    metric: Gaussians, middle: Float[Tensor, "3"], sky: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """Linear light and share of the sky in all directions above the horizon."""
     elevation = (torch.arange(HIGH) + 0.5) / HIGH * (math.pi / 2)
     azimuth = (torch.arange(WIDE) + 0.5) / WIDE * (2 * math.pi)
@@ -134,13 +131,14 @@ def _around(metric: Gaussians, middle: Float[Tensor, "3"]) -> tuple[Float[Tensor
     viewmats[:, :3, :3], viewmats[:, :3, 3] = turns, -(turns @ middle)
     K = torch.tensor([[SIDE / 2, 0, SIDE / 2], [0, SIDE / 2, SIDE / 2], [0, 0, 1.0]]).repeat(5, 1, 1)
     with torch.no_grad():
-        seen = CpuRasterizer(metric).render(Cameras(viewmats, K, SIDE, SIDE))
+        cameras = Cameras(viewmats, K, SIDE, SIDE)
+        seen = CpuRasterizer(metric).render(cameras)
+        shares = replace(metric, colors=sky[:, None].expand(-1, 3).contiguous())
+        clouds = CpuRasterizer(shares).render(cameras).rgb[..., 0]
     face = (directions @ forward.T).argmax(1)
     ahead = (turns[face] @ directions[:, :, None])[:, :, 0]
     x, y = ((ahead[:, :2] / ahead[:, 2:] + 1) * SIDE / 2).long().clamp(0, SIDE - 1).unbind(1)
     covered = seen.accumulation[face, y, x]
     light = linear(seen.rgb[face, y, x] / covered.clamp_min(1e-3)[:, None])
-    low, high = SKY_LIGHT
-    bright = ((luminance(light) - low) / (high - low)).clamp(0, 1) * (directions[:, 2] > SKY_HEIGHT)
-    opened = 1 - covered.clamp(0, 1) * (1 - bright)
+    opened = (1 - covered + clouds[face, y, x]).clamp(0, 1)
     return light.reshape(HIGH, WIDE, 3), opened.reshape(HIGH, WIDE)

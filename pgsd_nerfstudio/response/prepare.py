@@ -23,6 +23,7 @@ from pgsd_nerfstudio.response.haze_field import HazeField
 from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.layer_making import layer_of
 from pgsd_nerfstudio.response.light import luminance
+from pgsd_nerfstudio.response.puddle_making import puddles_of, stored_water, water_of
 from pgsd_nerfstudio.response.sky import sky_share
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.frame import attention
@@ -35,7 +36,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
 MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
-_REVISION = 5  # of the computation; stored answers of another revision are not used
+_REVISION = 6  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -56,6 +57,7 @@ def answer_of(
     """
     # The file holds only the results of rays, so its key holds only the inputs of the rays.
     parts = (effect.emission, effect.material, effect.wind, effect.ambience, effect.surface.landing)
+    parts += (effect.surface.unevenness,)
     key = content_key("answer", _REVISION, scene.content_key(), surface.vertices, surface.triangles, *parts, seed)
     path = cache_dir() / "answers" / f"{key}.safetensors"
     answer = stored_answer(path, scene, effect, seconds=seconds, seed=seed)
@@ -64,7 +66,8 @@ def answer_of(
         exposure = Exposure.of(metric, surface, effect, seed=seed)
         softening = softening_of(metric, exposure, surface, effect)
         layer = layer_of(scene, metric, surface, effect, seed=seed)
-        answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed, layer=layer)
+        water = water_of(scene, metric, surface, effect, sky_of(scene, metric), seed=seed)
+        answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed, layer=layer, water=water)
         save_answer(path, answer)
     return replace(answer, edits=edits)
 
@@ -80,6 +83,8 @@ def save_answer(path: Path, answer: Answer) -> None:
         tensors["softening"] = answer.softening
     if answer.layer is not None:
         tensors |= {f"layer.{name}": tensor for name, tensor in answer.layer.tensors.items()}
+    if answer.puddles is not None:
+        tensors |= {f"water.{name}": tensor for name, tensor in stored_water(answer.puddles).items()}
     if answer.edits is not None:
         tensors |= {f"edited.{name}": tensor for name, tensor in answer.edits.tensors.items()}
     save_tensors(path, tensors, {"revision": _REVISION})
@@ -104,6 +109,7 @@ def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, s
     tensors = stored[0]
     softening = tensors.pop("softening", None)
     edited, lying = _taken(tensors, "edited."), _taken(tensors, "layer.")
+    water = _taken(tensors, "water.")
     if set(tensors) != {f.name for f in fields(Exposure)} or len(tensors["sky"]) != len(scene.gaussians):
         return None
     return composed(
@@ -115,6 +121,7 @@ def stored_answer(path: Path, scene: Scene, effect: Effect, *, seconds: float, s
         seed=seed,
         edits=Edits(**edited) if edited else None,
         layer=Layer(**lying, frame=scene.frame) if lying else None,
+        water=water,
     )
 
 
@@ -133,6 +140,7 @@ def composed(
     seed: int = 0,
     edits: Edits | None = None,
     layer: Layer | None = None,
+    water: dict[str, Tensor] | None = None,
 ) -> Answer:
     """The answer from the results of rays; haze and coating follow from the effect.
 
@@ -145,10 +153,10 @@ def composed(
         seed: of patches and the variation of the cover.
         edits: change by edited pictures.
         layer: cover on the surface of the scene.
+        water: of `water_of`; None: no water stands.
     """
     metric, centers = to_metric(scene), scene.frame.to_metric(scene.cameras.centers)
-    _, radius = attention(scene.cameras, scene.gaussians)
-    sky = sky_share(metric, centers, radius * scene.frame.metres_per_unit)
+    sky = sky_of(scene, metric)
     below = replace(exposure, catches=exposure.catches * (1 - sky))  # nothing lies on the sky
     return Answer(
         effect=effect,
@@ -161,8 +169,20 @@ def composed(
         edits=edits,
         sky=sky if bool((sky > 0).any()) else None,
         layer=layer,
+        puddles=puddles_of(water or {}, scene, metric, effect, exposure),
         seconds=seconds,
     )
+
+
+def sky_of(scene: Scene, metric: Gaussians) -> Float[Tensor, " n"]:
+    """Share of each Gaussian that is sky, 0..1.
+
+    Args:
+        scene: the frozen scene.
+        metric: its Gaussians in metres, with plain RGB.
+    """
+    _, radius = attention(scene.cameras, scene.gaussians)
+    return sky_share(metric, scene.frame.to_metric(scene.cameras.centers), radius * scene.frame.metres_per_unit)
 
 
 def edits_of(scene: Scene, folder: Path, device: torch.device | str, *, seed: int = 0) -> Edits:

@@ -17,8 +17,8 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
-from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.standing_water import Pools, StandingWater, depth_over
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import encoded, linear
@@ -32,7 +32,6 @@ from pgsd_nerfstudio.response.ripples import Ripples, tilted
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 WATER = 1000.0  # kg/m^3
 FULL = 0.0006  # m of water under which nothing of the ground stands out
@@ -80,25 +79,19 @@ class Puddles:
         frame: Frame,
         metric: Gaussians,
         exposure: Exposure,
-        surface: SurfaceMesh,
-        domain: Domain,
-        *,
+        ground: StandingWater,
         scene: MirroredScene,
-        seed: int,
     ) -> Puddles:
         """The puddles of a scene under an effect.
 
         Args:
-            effect: its surface response says how uneven the ground is.
+            effect: the weather.
             frame: of the scene.
             metric: the frozen Gaussians in metres, with plain RGB.
             exposure: of the Gaussians.
-            surface: mesh of the scene in metres.
-            domain: bounds of the ground that holds water.
+            ground: its hollows.
             scene: the surroundings that water mirrors.
-            seed: of the unevenness.
         """
-        ground = StandingWater.of(surface, domain, unevenness=effect.surface.unevenness, seed=seed)
         at = metric.means.double().numpy()
         basin, floor = ground.under(at[:, :2])
         part = np.abs(at[:, 2] - ground.height(at[:, :2], floor)) < SUNK
@@ -137,6 +130,24 @@ class Puddles:
         """The same puddles with the rings of a simulation's drops."""
         return replace(self, ripples=Ripples.of(history, self.ground, self.effect.material))
 
+    def seen(self, points: Float[Tensor, "m 3"], directions: Float[Tensor, "m 3"], weather: float) -> Float[Tensor, "m 3"]:
+        """Linear light that water mirrors: that of the scene, or of the even sky alone.
+
+        Args:
+            points: of the water, metres.
+            directions: metric unit vectors away from it.
+            weather: share of the full weather, 0..1.
+        """
+        ambience = self.effect.ambience
+        if self.effect.surface.mirror:
+            return self.scene.seen(points, directions, ambience, weather)
+        return linear(torch.tensor((ambience or Ambience()).sky)).to(points).expand(len(points), 3)
+
+    @property
+    def rippling(self) -> bool:
+        """Whether drops make rings."""
+        return self.effect.surface.puddles and self.effect.surface.ripples
+
     def mirrored(self, cosine: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """Share of light that water mirrors, from the cosine to its normal: Fresnel's law times the sheen, at most 1."""
         return (self.effect.surface.sheen * mirrored(cosine)).clamp_max(1.0) * (cosine > 0)
@@ -146,7 +157,7 @@ class Puddles:
         fallen = falling_mass(self.effect) / WATER * rained(self.effect, seconds) * self.effect.surface.accumulation_speedup
         pools = self.ground.after(fallen)
         depth = depth_over(pools, self.basin.numpy(force=True), self.floor.numpy(force=True))
-        share = torch.from_numpy(shown(depth)).to(self.floor)
+        share = torch.from_numpy(shown(depth)).to(self.floor) * self.effect.surface.puddles
         return PuddlesNow(self, seconds, pools, share)
 
 
@@ -179,14 +190,14 @@ class PuddlesNow:
             wet: share of each that is wet, 0..1.
             weather: share of the full weather, 0..1.
         """
-        puddles, response = self.puddles, self.puddles.effect.surface
+        puddles = self.puddles
         under = self.share[ids].to(towards) * wet
         pooled = (under > 0).nonzero()[:, 0]
         up = torch.tensor([0.0, 0.0, 1.0]).to(towards)
         # A film is smoother than the ground below it, and the normals of captured Gaussians and meshes are rough by themselves.
         facing = torch.nn.functional.normalize(normals.to(towards) + FILLED * up, dim=1)
         facing[pooled] = up
-        if puddles.ripples is not None and response.ripples and len(pooled):
+        if puddles.ripples is not None and puddles.rippling and len(pooled):
             which = ids[pooled]
             slopes = puddles.ripples.slopes(puddles.points[which, :2].double().numpy(force=True), self.seconds)
             # Waves shorter than a Gaussian tilt its halves against each other.
@@ -199,7 +210,7 @@ class PuddlesNow:
         bright = (share > LEAST_MIRRORED).nonzero()[:, 0]
         if len(bright):
             away = reflected(towards[bright], facing[bright])
-            seen = puddles.scene.seen(puddles.points[ids[bright]], away, puddles.effect.ambience, weather)
+            seen = puddles.seen(puddles.points[ids[bright]], away, weather)
             light[bright] = share[bright, None] * seen.to(towards)
         return light, share
 
@@ -212,7 +223,7 @@ class PuddlesNow:
             weather: share of the full weather, 0..1.
         """
         puddles = self.puddles
-        if puddles.ripples is None or not puddles.effect.surface.ripples or len(puddles.bottom_ids) == 0:
+        if puddles.ripples is None or not puddles.rippling or len(puddles.bottom_ids) == 0:
             return None
         one = Cameras(view.viewmat.cpu().float()[None], view.K.cpu().float()[None], view.width, view.height)
         camera = puddles.frame.cameras_to_metric(one)
@@ -231,7 +242,7 @@ class PuddlesNow:
         towards = torch.nn.functional.normalize(camera.centers[0] - points, dim=1)
         cosine = (normals * towards).sum(1)
         fresnel = puddles.mirrored(cosine)
-        seen = puddles.scene.seen(points, reflected(towards, normals), puddles.effect.ambience, weather)
+        seen = puddles.seen(points, reflected(towards, normals), weather)
         ground = linear(below(torch.from_numpy(puddles.bottom_ids[nearest[kept]])).cpu())
         light = (1 - fresnel)[:, None] * ground + fresnel[:, None] * seen
         drawn = arcs.gaussians(points + TOWARDS * towards, torch.from_numpy(share).float(), encoded(light))

@@ -67,8 +67,8 @@ class StandingWater:
     """Height of each cell above the plane that counts as level, m; NaN where there is no surface."""
     level: Float[ndarray, "3"]
     """That plane: its height in metres at the origin, and its rise along x and y."""
-    area: float
-    """m^2 of ground that rain falls on."""
+    under_sky: Bool[ndarray, "x y"]
+    """Cells that rain falls on; the others are below tables and roofs, or have no surface."""
     basin: Int[ndarray, "x y"]
     """Number of the hollow that a cell is part of, -1 for none."""
     catchment: Float[ndarray, " b"]
@@ -139,8 +139,12 @@ class StandingWater:
         held = basin >= 0
         brims[basin[held]] = filled[held]
         level = np.zeros(3) if level is None else level
-        area = float(rained_on.sum()) * cell**2
-        return StandingWater(lower, cell, ground, level, area, basin, catchment * cell**2, into, brims)
+        return StandingWater(lower, cell, ground, level, rained_on, basin, catchment * cell**2, into, brims)
+
+    @property
+    def area(self) -> float:
+        """m^2 of ground that rain falls on."""
+        return float(self.under_sky.sum()) * self.cell**2
 
     def after(self, fallen: float) -> Pools:
         """The water after rain.
