@@ -57,7 +57,7 @@ def test_looks_vary_within_what_snow_can_be(look):
 def test_patches_have_the_volume_of_the_snow_they_stand_for():
     plain = replace(SNOWFALL.appearance, collided=replace(SNOWFALL.appearance.collided, scale_spread=0.0))
     free = Landed()
-    free.rest_extents = torch.full((2000,), 10.0)
+    free.rest_extents, free.represents = torch.full((2000,), 10.0), Landed.represents / 15
     scales = initial_look(replace(SNOWFALL, appearance=plain), free).collided.scales
     volume = (2 * np.pi) ** 1.5 * scales.prod(1)
     water = torch.from_numpy(mass(free.diameters.double().numpy())) * free.represents
@@ -69,9 +69,15 @@ def test_patches_have_the_volume_of_the_snow_they_stand_for():
 def test_a_time_lapse_makes_patches_wider_not_thicker():
     faster = replace(SNOWFALL.surface, accumulation_speedup=4 * SNOWFALL.surface.accumulation_speedup)
     free = Landed()
-    free.rest_extents = torch.full((2000,), 10.0)
-    slow, fast = (initial_look(replace(SNOWFALL, surface=layer), free).collided.scales for layer in (SNOWFALL.surface, faster))
+    free.rest_extents, free.represents = torch.full((2000,), 10.0), Landed.represents / 15
+    plain = replace(SNOWFALL.appearance, collided=replace(SNOWFALL.appearance.collided, scale_spread=0.0))
+    flakes = replace(SNOWFALL, appearance=plain)
+    slow, fast = (initial_look(replace(flakes, surface=layer), free).collided.scales for layer in (SNOWFALL.surface, faster))
     torch.testing.assert_close(fast / slow, torch.tensor([2.0, 2.0, 1.0]).expand(2000, 3), rtol=1e-4, atol=0)
+
+
+def test_no_patch_is_wider_than_two_centimetres(look):
+    assert look.collided.scales.max() == pytest.approx(0.02)
 
 
 def test_no_patch_hangs_over_an_edge(look):

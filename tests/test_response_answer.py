@@ -1,5 +1,6 @@
 """The answer of the frozen scene: the untouched scene before the weather, unchanged tensors, and each part in its place."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -177,16 +178,34 @@ def test_baked_gaussians_look_like_the_moment_without_air():
 
 
 @pytest.mark.mistyped
-def test_collided_particles_take_the_light_of_their_place():
+def test_collided_particles_take_the_light_of_their_place_and_lie_only_where_they_can():
     n = GRID**2
     exposure = answer(effect("snowfall")).exposure
     half = torch.where(UNIT * floor().means[:, 0] < 0, 0.1, 1.0)  # one side of the floor sees hardly any sky
     shaded = replace(answer(effect("snowfall")), exposure=replace(exposure, sky=half))
-    look = ParticleLook(torch.ones(3), torch.ones(3, 3), torch.full((3, 3), 0.9))
-    places = torch.tensor([[-1.5, 0.0, 0], [1.5, 0.0, 0], [-1.5, 0.5, 0]])
-    history = SimpleNamespace(collided=torch.tensor([True, True, False]), rest_positions=places)
-    found = in_place(InitialLook(look, look, 0.0), history, shaded, UNIT * floor().means).collided.rgb
-    assert len(half) == n and (found[0] < 0.85).all() and found[0, 2] > found[0, 0]
-    assert torch.allclose(found[1], look.rgb[1], atol=1e-5) and torch.equal(found[2], look.rgb[2])
+    look = ParticleLook(torch.ones(5), torch.ones(5, 3), torch.full((5, 3), 0.9))
+    places = torch.tensor([[-1.5, 0.0, 0], [1.5, 0.0, 0], [-1.5, 0.5, 0], [1.5, 0.0, 0.3], [1.5, 0.2, 0]])
+    flat, wall = [1.0, 0, 0, 0], [0.5**0.5, 0.5**0.5, 0, 0]
+    history = SimpleNamespace(
+        collided=torch.tensor([True, True, False, True, True]),
+        rest_positions=places,
+        rest_quats=torch.tensor([flat, flat, flat, flat, wall]),
+    )
+    metric = FRAME.gaussians_to_metric(replace(floor(), colors=torch.zeros(n, 3)))
+    found = in_place(InitialLook(look, look, 0.0), history, shaded, metric).collided
+    assert len(half) == n and (found.rgb[0] < 0.85).all()
+    assert torch.allclose(found.rgb[1], look.rgb[1], atol=1e-5) and torch.equal(found.rgb[2], look.rgb[2])
+    assert found.opacity.tolist() == [1, 1, 1, 0, 0]  # the fourth hangs in the air, the fifth lies on a wall
     bare = replace(shaded, effect=replace(effect("snowfall"), ambience=None))
-    assert torch.equal(in_place(InitialLook(look, look, 0.0), history, bare, UNIT * floor().means).collided.rgb, look.rgb)
+    assert torch.equal(in_place(InitialLook(look, look, 0.0), history, bare, metric).collided.rgb, look.rgb)
+
+
+@pytest.mark.mistyped
+def test_the_layer_hides_flakes_that_landed_before_it_and_soon_after_contact_those_that_land_on_it():
+    look = ParticleLook(torch.ones(3), torch.ones(3, 3), torch.full((3, 3), 0.9))
+    whole = InitialLook(look, look, 0.0, torch.tensor([2.0, 2.0, math.inf]))
+    run = SimpleNamespace(ends=torch.tensor([1, 100, 1]), fps=25.0)
+    ids = torch.arange(3)
+    assert whole.collided_at(run, 49, ids).opacity.tolist() == [1, 1, 1]
+    assert whole.collided_at(run, 75, ids).opacity.tolist() == [0, 1, 1]
+    assert whole.collided_at(run, 110, ids).opacity.tolist() == [0, 0, 1]

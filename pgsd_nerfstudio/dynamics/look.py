@@ -68,7 +68,8 @@ class LearnedLook(nn.Module):
 
     def forward(self, look: InitialLook) -> InitialLook:
         """The initial look, shifted."""
-        return InitialLook(_shifted(look.active, self.active), _shifted(look.collided, self.collided), look.settle_seconds)
+        active, collided = _shifted(look.active, self.active), _shifted(look.collided, self.collided)
+        return InitialLook(active, collided, look.settle_seconds, look.buried)
 
     def bounded(self) -> tuple[Change, Change]:
         """The shifts in use (active, collided), each as a Change of one particle whose opacity is a logit."""

@@ -1,8 +1,7 @@
 """The look of particles before training: curated numbers of the Effect, varied from particle to particle.
 
 An active particle takes its size from the diameter that the physics drew for it: near flakes cover several pixels, far ones are
-faint dots. A collided flake spreads into a thin soft patch, which stands for the water that would have gathered there
-(SurfaceResponse.accumulation_speedup). Patches of many sizes and tones overlap into a cover.
+faint dots. A collided flake spreads into a small thin patch, which vanishes in the scene's layer of cover where there is one.
 """
 
 from __future__ import annotations
@@ -19,6 +18,9 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect, StateLook
 from pgsd_nerfstudio.effects.matter import Array
+
+BURIAL = 0.3  # s in which a layer hides a collided particle
+WIDEST = 0.02  # m; standard deviation of a collided particle along the surface, at most
 
 
 @runtime_checkable
@@ -53,6 +55,10 @@ class ParticleLook:
         """The look of the chosen particles, by mask or by index."""
         return ParticleLook(self.opacity[which], self.scales[which], self.rgb[which])
 
+    def fainter(self, factor: Float[Tensor, " p"]) -> ParticleLook:
+        """The same look with the opacities multiplied by a factor in 0..1."""
+        return ParticleLook(self.opacity * factor, self.scales, self.rgb)
+
     def to(self, device: torch.device | str) -> ParticleLook:
         return ParticleLook(self.opacity.to(device), self.scales.to(device), self.rgb.to(device))
 
@@ -65,16 +71,21 @@ class InitialLook:
     collided: ParticleLook
     settle_seconds: float
     """Time after contact in which a particle changes from the first look to the second."""
+    buried: Float[Tensor, " p"] | None = None
+    """Second from which a layer of cover hides each collided particle, inf if none does; None: there is no layer."""
 
     def select(self, ids: Int[Tensor, " n"]) -> InitialLook:
         """The look of the chosen particles."""
-        return InitialLook(self.active.select(ids), self.collided.select(ids), self.settle_seconds)
+        buried = None if self.buried is None else self.buried[ids]
+        return InitialLook(self.active.select(ids), self.collided.select(ids), self.settle_seconds, buried)
 
     def to(self, device: torch.device | str) -> InitialLook:
-        return InitialLook(self.active.to(device), self.collided.to(device), self.settle_seconds)
+        buried = None if self.buried is None else self.buried.to(device)
+        return InitialLook(self.active.to(device), self.collided.to(device), self.settle_seconds, buried)
 
     def collided_at(self, particles: Particles, frame: int, ids: Int[Tensor, " n"]) -> ParticleLook:
-        """The look of collided particles, each of which spreads from its flake to its patch within `settle_seconds`.
+        """The look of collided particles, each of which spreads from its flake to its patch within `settle_seconds`, and
+        vanishes when a layer hides it, or soon after contact if that lies there already.
 
         Args:
             particles: all particles, of which `ends` and `fps` are read.
@@ -82,9 +93,13 @@ class InitialLook:
             ids: indices of the collided particles that are asked for.
         """
         flake, patch = self.active.select(ids), self.collided.select(ids)
+        age = (frame - particles.ends[ids] + 1).clamp_min(0) / particles.fps
+        if self.buried is not None:
+            since = torch.minimum(frame / particles.fps - self.buried[ids], age.to(self.buried))
+            left = (1 - since / BURIAL).clamp(0, 1).to(patch.opacity)
+            flake, patch = flake.fainter(left), patch.fainter(left)
         if self.settle_seconds <= 0:
             return patch
-        age = (frame - particles.ends[ids] + 1).clamp_min(0) / particles.fps
         grown = (age / self.settle_seconds).clamp(0, 1).to(patch.opacity)
         grown = (grown * (2 - grown))[:, None]  # fast at first, as the radius of a patch whose area grows at a constant rate
         # The thin axis is thin from the start, since a flake lies flat on contact.
@@ -117,8 +132,9 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
         thin = (diameters / looks.active.fades_below).clamp_max(1.0) ** 2
         active = ParticleLook(active.opacity * thin, active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
-    # A patch is not wider than the surface around it, so that it does not hang over the edge of a table.
-    widest = (particles.rest_extents.cpu() / REACH).clamp_min(0.004)
+    # A patch is not wider than the surface around it, so that it does not hang over the edge of a table, and never so wide that
+    # it would look like a ball of wool: the answer of the scene draws the cover.
+    widest = (particles.rest_extents.cpu() / REACH).clamp(0.004, WIDEST)
     scales = torch.cat([torch.minimum(collided.scales[:, :2], widest[:, None]), collided.scales[:, 2:]], 1)
     scales[:, 2] = torch.minimum(scales[:, 2], 0.5 * scales[:, :2].amin(1))
     collided = ParticleLook(collided.opacity, scales, collided.rgb)

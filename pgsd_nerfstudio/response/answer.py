@@ -32,6 +32,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 if TYPE_CHECKING:
+    from pgsd_nerfstudio.physics.record.history import ParticleHistory
     from pgsd_nerfstudio.rendering.medium import Medium
     from pgsd_nerfstudio.response.edits import Edits
     from pgsd_nerfstudio.response.haze_field import HazeField
@@ -96,6 +97,12 @@ class Answer:
         haze = None if self.haze is None else self.haze.beside(self.effect, sharpness)
         return replace(self, haze=haze, number=next(_numbers))
 
+    def struck_by(self, history: ParticleHistory) -> Answer:
+        """The same answer with the rings of a simulation's drops on its standing water."""
+        if self.puddles is None:
+            return self
+        return replace(self, puddles=self.puddles.struck_by(history), number=next(_numbers))
+
     def thicker(self, factor: float) -> Answer:
         """The same answer with the extinction of its haze multiplied by `factor`."""
         if self.haze is None or factor == 1.0:
@@ -154,6 +161,11 @@ class Shown:
         return self.answer.effect.timeline.share(self.seconds)
 
     @cached_property
+    def thickness(self) -> Float[Tensor, " n"]:
+        """Thickness of the cover on each Gaussian in metres."""
+        return self.answer.coating.thickness(self.seconds)
+
+    @cached_property
     def pieces(self) -> tuple[Int[Tensor, " k"], Float[Tensor, " k"], Float[Tensor, " k"]] | None:
         """Pieces of the layer that are there, as `Layer.grown`; None if there are none or if edited pictures show the cover."""
         if self.answer.layer is None or self.answer.edits is not None:
@@ -167,14 +179,14 @@ class Shown:
         return None if self.answer.puddles is None else self.answer.puddles.at(self.seconds)
 
     def adds(self, view: Viewpoint) -> Gaussians | None:
-        """The rings of drops on standing water near a camera, in scene units; None if it sees none.
+        """The rings and crowns of drops near a camera, in scene units; None if it sees none.
 
         Args:
             view: the camera.
         """
         if self.puddles is None or self.share == 0:
             return None
-        return self.puddles.rings(view, lambda ids: self.lit(self.answer.puddles.rgb[ids], ids, None), self.share)
+        return self.puddles.drawn(view, lambda ids: self.lit(self.answer.puddles.rgb[ids], ids, None), self.share)
 
     def altered(self, frozen: Gaussians) -> Gaussians:
         """The frozen Gaussians with the edits; without edits they are wider and more opaque under a cover, and followed by the
@@ -277,7 +289,7 @@ class Shown:
             height = torch.full_like(light[:, 0], EVEN) if towards is None else -towards[:, 2]
             clouded = (self.share * effect.ambience.clouds * self.answer.sky[ids, None]).to(light)
             light = torch.lerp(light, overcast(height, effect.ambience.sky), clouded)
-        cover = cover_light(light, effect.appearance.collided.rgb, exposure.sky[ids])
+        cover = cover_light(light, self.thickness[ids], exposure.sky[ids], effect.appearance.collided.rgb)
         return torch.lerp(light, cover, self.hidden[ids, None].to(light))
 
 

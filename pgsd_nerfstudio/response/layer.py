@@ -4,11 +4,10 @@ Its pieces lie on the scene's surface (`layer_making`). They appear in the order
 crisp patches, and are lifted by the cover's depth as it grows. Where the surface ends they are tilted outwards, which rounds
 the rim.
 
-Light: a matt layer of albedo a under a uniform sky of radiance L, which sees the share s of it, has the radiance
-a L s / (1 - b (1 - s)) if its surroundings have the mean albedo b and see as much of the sky as it does itself. Fresh snow of
+Its light is that of matt matter under an even sky (`light.received`). Fresh snow of
 fine grains reflects more than 95 % of the visible light (Wiscombe & Warren, "A model for the spectral albedo of snow. I: Pure
 snow", 1980, fig. 8), with the soot that falls outside the polar regions 80-90 % (Warren & Wiscombe, "II: Snow containing
-atmospheric aerosols", 1980). The colour of the cover in the open, which contains a L, is Appearance.collided.rgb.
+atmospheric aerosols", 1980). The colour of the cover in the open is Appearance.collided.rgb.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.response.coating import falling_mass
+from pgsd_nerfstudio.response.light import received
 from pgsd_nerfstudio.response.patchiness import covered_share, hidden_share
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-AROUND = 0.6  # mean albedo of a cover's surroundings: most of it cover, some of it wood, walls and leaves
 OPAQUE = 0.985  # opacity of a piece in full; three of them overlap everywhere
 WIDTH = 0.62  # standard deviation of a piece along the surface, relative to the distance between pieces
 BUD = 0.55  # width of a piece that appears, relative to its full width
@@ -142,11 +141,6 @@ class Layer:
         """
         white = linear(torch.tensor(rgb).to(self.points))
         return white * (self.tone[there] * received(self.sky[there]))[:, None]
-
-
-def received(sky: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Light that reaches a surface, relative to that of the open sky, from the share of the sky that it sees."""
-    return sky / (1 - AROUND * (1 - sky))
 
 
 def upright(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:

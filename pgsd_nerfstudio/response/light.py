@@ -16,7 +16,7 @@ WATER = 1.33  # index of refraction
 DRY_ASYMMETRY, WET_ASYMMETRY = 0.80, 0.92
 """Asymmetry of grains in air and in water. Twomey et al. take up to 0.97 for grains in water; surfaces soak up less."""
 LEAST_GREEN, MOST_GREEN = 0.05, 0.25  # excess of green in linear light: that of grey stone with moss, and that of leaves
-SHELTERED = (0.42, 0.46, 0.55)  # linear light without any sky; it is bluish and comes from the surroundings
+AROUND = 0.6  # mean albedo around a cover: most of it cover, some of it wood, walls and leaves
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue (Rec. 709)
 
 
@@ -68,7 +68,9 @@ def mirrored(cosine: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     return 0.5 * (across**2 + along**2)
 
 
-def under_sky(sky: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """Linear light on white matter from its share of the overcast sky; 1 in the open."""
-    open_share = sky.clamp(0, 1).sqrt()[:, None]  # the root stands for light from bright surroundings
-    return torch.lerp(torch.tensor(SHELTERED).to(sky), torch.ones(3).to(sky), open_share)
+def received(sky: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Light that reaches a surface, relative to that of the open sky, from the share of an even sky that it sees.
+
+    Surroundings of the mean albedo b that see the same share s lend light again and again: s / (1 - b (1 - s)).
+    """
+    return sky / (1 - AROUND * (1 - sky))

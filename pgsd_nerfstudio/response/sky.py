@@ -1,8 +1,8 @@
 """The sky of a captured scene: which Gaussians show it, and how it looks under a weather.
 
 Captures of the outdoors often end in a sphere of Gaussians that show the sky, at any distance. Weather does not lie on them,
-and haze before them is that before the sky. Beyond five times the distance of the cameras from what they look at, and not far below
-the horizon, what is bright and not green counts as sky.
+and haze before them is that before the sky. Beyond five times the distance of the cameras from what they look at, and not far
+below the horizon, what is bright and not green counts as sky.
 
 Clouds give the sky of the weather: L = L0 (1 + b sin h) at the height h, b = 2 for the CIE's overcast sky (Moon & Spencer,
 "Illumination from a non-uniform sky", 1942). Light from bright ground lifts the horizon; b is 1 here, between that and an even

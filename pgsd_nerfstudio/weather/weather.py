@@ -19,6 +19,7 @@ from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.physics.record.report import report
 from pgsd_nerfstudio.response.answer import Answer, Shown
 from pgsd_nerfstudio.response.landed import in_place
+from pgsd_nerfstudio.response.prepare import to_metric
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
@@ -47,7 +48,7 @@ class Weather:
     def look(self) -> InitialLook:
         """The initial look of all particles; collided ones are in the light of their place."""
         look = initial_look(self.effect, self.history, seed=self.options.seed)
-        return in_place(look, self.history, self.answer, self.scene.frame.to_metric(self.scene.gaussians.means))
+        return in_place(look, self.history, self.answer, to_metric(self.scene))
 
     @cached_property
     def sequence(self) -> GaussianSequence:
