@@ -64,7 +64,9 @@ def test_every_point_of_a_triangle_has_one_within_the_spacing():
     assert np.linalg.norm(at[:, None] - found, axis=2).min(1).max() <= 0.2
 
 
-@pytest.mark.parametrize("make", [lambda mesh: Ground.of(mesh, SurfaceResponse(), DOMAIN).near, lambda mesh: _keys(mesh)])
+@pytest.mark.parametrize(
+    "make", [lambda mesh: Ground.of(mesh, SurfaceResponse(), DOMAIN).clearance.parts, lambda mesh: _keys(mesh)]
+)
 def test_maps_of_a_floor_do_not_depend_on_how_far_it_goes_and_neither_does_their_memory(make):
     """A floor of 400 km in points 6 cm apart would be 10^14 of them."""
     expected = make(floor(3.0))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt32
 from torch import Tensor
 
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer
@@ -23,6 +23,7 @@ from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.depth import SETTINGS, chosen_views, render_depths, without_sky
 from pgsd_nerfstudio.surface.fusion import Fusion, Region, fuse, open3d, without_silhouettes
+from pgsd_nerfstudio.surface.smooth_normals import smooth_normals
 
 VERSION = 2  # of the fusion; cached meshes of another version are not read
 NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance from the cameras to what they look at
@@ -54,6 +55,18 @@ class Closest(NamedTuple):
     """Metres, never negative; inf if the mesh is empty."""
 
 
+class RayHits(NamedTuple):
+    """First hits of n rays as Open3D returns them; without a hit the distance is inf and the rest means nothing."""
+
+    distance: Float[np.ndarray, " n"]
+    """In lengths of the ray's direction."""
+    triangles: UInt32[np.ndarray, " n"]
+    weights: Float[np.ndarray, "n 2"]
+    """Weights of the triangle's second and third corner at the hit."""
+    own_normals: Float[np.ndarray, "n 3"]
+    """Normals of the triangles."""
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles in metres, z up. Their winding faces the open side, from which the cameras saw them. A mesh may be empty."""
@@ -83,9 +96,29 @@ class SurfaceMesh:
         n = len(origins)
         if len(self.triangles) == 0 or n == 0:
             return Hits(torch.full((n,), torch.inf), torch.zeros(n, 3))
+        found = self.first_hits(origins, directions)
+        normals, hit = np.zeros((n, 3), np.float32), np.isfinite(found.distance).nonzero()[0]
+        normals[hit] = self.normals_of(found, hit)
+        return Hits(torch.from_numpy(found.distance), torch.from_numpy(normals))
+
+    def first_hits(self, origins: Points, directions: Points) -> RayHits:
+        """First hits of rays as `cast` finds them, without normals, which take longer than the rays; for a mesh with triangles.
+
+        Args:
+            origins: where the rays start, in metres.
+            directions: of any length; distances count in this length.
+        """
         found = self.raycasting.cast_rays(queries(origins, directions))
-        distance = torch.from_numpy(found["t_hit"].numpy())
-        return Hits(distance, self._normals_at(found, torch.isfinite(distance)))
+        return RayHits(*(found[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")))
+
+    def normals_of(self, found: RayHits, which: Int[np.ndarray, " h"]) -> Float[np.ndarray, "h 3"]:
+        """Unit normals of the open side at some of the hits.
+
+        Args:
+            found: hits of rays.
+            which: indices of rays that have a hit.
+        """
+        return smooth_normals(self.corner_normals, found.triangles, found.weights, found.own_normals, which)
 
     def closest(self, points: Points) -> Closest:
         """Nearest points of the surface, however far away.
@@ -101,7 +134,10 @@ class SurfaceMesh:
         found = self.raycasting.compute_closest_points(query)
         nearest = torch.from_numpy(found["points"].numpy())
         distance = (nearest - torch.from_numpy(query.numpy())).norm(dim=1)
-        return Closest(nearest, self._normals_at(found, torch.ones(len(nearest), dtype=torch.bool)), distance)
+        own = found["primitive_normals"].numpy()
+        hits = RayHits(distance.numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy(), own)
+        normals = self.normals_of(hits, np.arange(len(nearest)))
+        return Closest(nearest, torch.from_numpy(normals), distance)
 
     @cached_property
     def vertex_normals(self) -> Float[Tensor, "v 3"]:
@@ -112,6 +148,11 @@ class SurfaceMesh:
         return torch.nn.functional.normalize(total, dim=1)
 
     @cached_property
+    def corner_normals(self) -> Float[np.ndarray, "f 3 3"]:
+        """Unit normals at the corners of every triangle."""
+        return self.vertex_normals.numpy()[self.triangles.numpy()]
+
+    @cached_property
     def raycasting(self) -> Any:
         """Open3D's scene of the triangles, for rays and distances."""
         o3d = open3d()
@@ -119,17 +160,6 @@ class SurfaceMesh:
         triangles = np.ascontiguousarray(self.triangles.numpy().astype(np.uint32))
         scene.add_triangles(o3d.core.Tensor(self.vertices.numpy()), o3d.core.Tensor(triangles))
         return scene
-
-    def _normals_at(self, found: dict[str, Any], hit: Tensor) -> Float[Tensor, "n 3"]:
-        """Vertex normals interpolated at each hit; the triangle's own normal if the interpolated one nearly vanishes."""
-        normals = torch.zeros(len(hit), 3)
-        which = torch.from_numpy(found["primitive_ids"].numpy().astype(np.int64))[hit]
-        u, v = torch.from_numpy(found["primitive_uvs"].numpy())[hit].unbind(1)
-        corners = self.vertex_normals[self.triangles[which].long()]
-        blend = (torch.stack([1 - u - v, u, v], 1)[:, :, None] * corners).sum(1)
-        flat = torch.from_numpy(found["primitive_normals"].numpy())[hit]
-        normals[hit] = torch.nn.functional.normalize(torch.where(blend.norm(dim=1, keepdim=True) > 0.1, blend, flat), dim=1)
-        return normals
 
 
 def surface_of(
@@ -219,5 +249,8 @@ def _fuse_within(
 
 def queries(*parts: Points) -> Any:
     """Points, or origins and directions, as the tensor that Open3D expects."""
-    columns = [torch.as_tensor(part).detach().float().cpu() for part in parts]
-    return open3d().core.Tensor(torch.cat(columns, dim=1).contiguous().numpy())
+    arrays = [part.numpy(force=True) if isinstance(part, Tensor) else part for part in parts]
+    rows = np.empty((len(arrays[0]), 3 * len(arrays)), np.float32)
+    for column, array in enumerate(arrays):
+        rows[:, 3 * column : 3 * column + 3] = array
+    return open3d().core.Tensor(rows)

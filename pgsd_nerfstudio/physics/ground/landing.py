@@ -18,14 +18,11 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.ground.sampling import points_within
+from pgsd_nerfstudio.surface.clearance import Clearance
 
 if TYPE_CHECKING:
-    from pgsd_nerfstudio.surface.mesh import Hits, SurfaceMesh
+    from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-CELL = 0.12  # m; smallest cell of the map of the surface
-MAX_CELLS = 20_000_000  # of that map; larger scenes have larger cells
-BAND = 3  # cells around the surface that count as near: a path shorter than (BAND - 1) cells cannot reach it from outside
 PROBE_RINGS = (0.25, 0.5, 1.0)  # radii of the rings, relative to SurfaceResponse.probe
 PROBES = 8  # rays per ring
 SMALLEST = 0.15  # relative to SurfaceResponse.probe; extent where the first ring finds no surface, as on a blade of grass
@@ -83,16 +80,11 @@ class RestPose(NamedTuple):
 
 @dataclass(frozen=True)
 class Ground:
-    """A surface prepared for contacts, with a map of the cells near it."""
+    """A surface prepared for contacts, with a map of the clearance around it."""
 
     surface: SurfaceMesh
     response: SurfaceResponse
-    lower: Float[ndarray, "3"]
-    """Corner of the first cell, metres."""
-    near: Bool[ndarray, "x y z"]
-    """Cells within BAND cells of the surface."""
-    cell: float
-    """Edge of a cell, metres."""
+    clearance: Clearance
 
     @staticmethod
     def of(surface: SurfaceMesh, response: SurfaceResponse, domain: Domain) -> Ground:
@@ -103,20 +95,7 @@ class Ground:
             response: how particles land on it.
             domain: the simulated air.
         """
-        lower = np.asarray(domain.lower, np.float64)
-        cell = max(CELL, (domain.volume / MAX_CELLS) ** (1 / 3))
-        shape = tuple(np.ceil(np.asarray(domain.size) / cell).astype(int) + 1)
-        near = torch.zeros(shape)
-        room = BAND * cell  # around the domain; a surface there makes cells at the border near
-        for points in points_within(surface, lower - room, lower + cell * np.asarray(shape) + room, cell / 2):
-            cells = np.floor((points - lower) / cell).astype(int)
-            cells = cells[((cells >= -BAND) & (cells < np.asarray(shape) + BAND)).all(1)].clip(0, np.asarray(shape) - 1)
-            near[tuple(cells.T)] = 1.0
-        for axis in range(3):  # grow a cube axis by axis
-            pooled = near.movedim(axis, 2).reshape(1, -1, shape[axis])
-            pooled = torch.nn.functional.max_pool1d(pooled, 2 * BAND + 1, 1, BAND)
-            near = pooled.reshape(near.movedim(axis, 2).shape).movedim(2, axis)
-        return Ground(surface, response, lower, near.numpy() > 0, cell)
+        return Ground(surface, response, Clearance.of(surface, np.asarray(domain.lower), np.asarray(domain.upper)))
 
     def meet(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], cover: Raised | None = None) -> Meeting:
         """First contacts of straight paths with the surface or the cover on it.
@@ -126,29 +105,23 @@ class Ground:
             stop: end of each path, m.
             cover: None where the surface is bare.
         """
-        path = stop - start
-        length = np.sqrt((path * path).sum(1))
         thickest = cover.thickest if cover is not None else 0.0
-        cells = ((start - self.lower.astype(start.dtype)) * start.dtype.type(1 / self.cell)).astype(np.int32)
-        inside = ((cells >= 0) & (cells < self.near.shape)).all(1)
-        x, y, z = np.where(inside[:, None], cells, 0).T
-        test = (self.near[x, y, z] | ~inside | (length + thickest > (BAND - 1) * self.cell)) & (length > 0)
-        tried = test.nonzero()[0]
+        tried = self.clearance.near(start, stop, thickest)
         if len(tried) == 0 or len(self.surface.triangles) == 0:
             return Meeting(tried[:0], start[:0], start[:0])
-        direction = path[tried] / length[tried, None]
-        hits = self._cast(start[tried], direction)
-        distance, normal = hits.distance.numpy(), hits.normal.numpy()
+        start = start[tried]
+        path = stop[tried] - start
+        length = np.sqrt((path * path).sum(1))
+        direction = path / length[:, None]
+        found = self.surface.first_hits(start, direction)
+        hit = (found.distance <= length + thickest / GRAZING).nonzero()[0]
+        start, direction, length, distance = start[hit], direction[hit], length[hit], found.distance[hit]
+        normal = self.surface.normals_of(found, hit)
         normal = np.where((normal * direction).sum(1, keepdims=True) > 0, -normal, normal)
         if cover is not None and thickest > 0:
-            distance, normal = _raised(cover, thickest, start[tried], direction, length[tried], distance, normal)
-        met = distance <= length[tried]
-        which = tried[met]
-        return Meeting(which, start[which] + direction[met] * distance[met, None], normal[met])
-
-    def _cast(self, origins: Float[ndarray, "n 3"], directions: Float[ndarray, "n 3"]) -> Hits:
-        as_single = (torch.from_numpy(np.ascontiguousarray(rays, np.float32)) for rays in (origins, directions))
-        return self.surface.cast(*as_single)
+            distance, normal = _raised(cover, start, direction, distance, normal)
+        met = distance <= length
+        return Meeting(tried[hit[met]], start[met] + direction[met] * distance[met, None], normal[met])
 
     def open_above(self, points: Float[ndarray, "n 3"], toward: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Whether the surface does not hide each point from the sky.
@@ -160,8 +133,7 @@ class Ground:
         if len(points) == 0 or len(self.surface.triangles) == 0:
             return np.ones(len(points), bool)
         direction = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-        hits = self._cast(points, direction)
-        return ~np.isfinite(hits.distance.numpy())
+        return ~np.isfinite(self.surface.first_hits(points, direction).distance)
 
     def holds(self, normals: Float[ndarray, "h 3"], draw: Float[ndarray, " h"]) -> Bool[ndarray, " h"]:
         """Whether particles stay at their contacts; they never stay on a surface that faces down.
@@ -187,9 +159,9 @@ class Ground:
         raised = np.zeros((len(points), 3))
         if covers is not None:
             raised[:, 2] = covers
-        points = points - raised
-        if len(points) == 0:
+        if len(points) == 0 or len(self.surface.triangles) == 0:
             return RestPose(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
+        points = points - raised
         closest = self.surface.closest(torch.from_numpy(points.astype(np.float32)))
         at, normal = closest.points.numpy(), _upward(closest.normals.numpy())
         normal, extent = self._probe(at, normal)
@@ -206,20 +178,24 @@ class Ground:
         """
         first, second = _tangents(normal)
         turns = 2 * np.pi * np.arange(PROBES) / PROBES
-        around = np.cos(turns)[:, None, None] * first + np.sin(turns)[:, None, None] * second  # [PROBES, h, 3]
+        around = np.cos(turns)[:, None] * first[:, None] + np.sin(turns)[:, None] * second[:, None]  # [h, PROBES, 3]
         extent = np.full(len(at), SMALLEST * self.response.probe, np.float32)
-        unbroken, total = np.ones(len(at), bool), 2.0 * normal
+        unbroken, total = np.arange(len(at)), 2.0 * normal
         for share in PROBE_RINGS:
+            if len(unbroken) == 0:
+                break
             radius = share * self.response.probe
             tolerance = ROUGH * radius + 0.01
-            origin = at + radius * around + 2 * tolerance * normal
-            down = np.broadcast_to(-normal, origin.shape)
-            hits = self._cast(origin.reshape(-1, 3), down.reshape(-1, 3))
-            distance = hits.distance.numpy().reshape(PROBES, -1)
-            same = np.abs(distance - 2 * tolerance) <= tolerance
-            normals = hits.normal.numpy().reshape(PROBES, -1, 3)
-            total = total + np.where((same & unbroken)[..., None], normals, 0.0).sum(0)
-            unbroken &= same.sum(0) >= PROBES - 1  # a single miss is a hole in a scanned mesh rather than an edge
+            above = at[unbroken] + 2 * tolerance * normal[unbroken]
+            origin = above[:, None] + radius * around[unbroken]
+            down = np.broadcast_to(-normal[unbroken, None], origin.shape)
+            found = self.surface.first_hits(origin.reshape(-1, 3), down.reshape(-1, 3))
+            same = (np.abs(found.distance - 2 * tolerance) <= tolerance).reshape(-1, PROBES)
+            normals = np.zeros((same.size, 3), np.float32)
+            hit = same.ravel().nonzero()[0]
+            normals[hit] = self.surface.normals_of(found, hit)
+            total[unbroken] += normals.reshape(-1, PROBES, 3).sum(1)
+            unbroken = unbroken[same.sum(1) >= PROBES - 1]  # a single miss is a hole in a scanned mesh rather than an edge
             extent[unbroken] = radius
         smooth = _upward(total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-6))
         return smooth, extent
@@ -227,10 +203,8 @@ class Ground:
 
 def _raised(
     cover: Raised,
-    thickest: float,
     start: Float[ndarray, "n 3"],
     direction: Float[ndarray, "n 3"],
-    length: Float[ndarray, " n"],
     distance: Float[ndarray, " n"],
     normal: Float[ndarray, "n 3"],
 ) -> tuple[Float[ndarray, " n"], Float[ndarray, "n 3"]]:
@@ -240,8 +214,7 @@ def _raised(
     over a particle.
     """
     into = -(direction * normal).sum(1)
-    near = np.isfinite(distance) & (normal[:, 2] > 0) & (distance <= length + thickest / GRAZING)
-    which = near.nonzero()[0]
+    which = (normal[:, 2] > 0).nonzero()[0]
     if len(which) == 0:
         return distance, normal
     base = start[which] + direction[which] * distance[which, None]

@@ -1,0 +1,190 @@
+"""A map of how far the surface is at least from every cell of a box: it tells which paths cannot reach the surface.
+
+A cell is occupied if a triangle may lie in it. The clearance of a cell is the distance between it and the nearest occupied one,
+which is never more than the distance from any point of the cell to the surface. A path is followed in steps as long as the
+clearance where it is ("sphere tracing", Hart 1996), and is free if it ends before it comes to a cell without clearance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+
+from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+
+CELL = 0.05  # m; smallest edge of a cell
+MAX_CELLS = 6_000_000  # a byte each; larger boxes have larger cells
+REACH = 8  # cells; distances beyond are not told apart
+PARTS = 16  # of a cell in which clearance is counted
+ROOM = 1e-4  # cells by which a triangle may lie beside a cell that it occupies
+
+
+class Clearance(NamedTuple):
+    """Clearance in the cells of a box and of REACH cells around it."""
+
+    lower: Float[ndarray, "3"]
+    """Corner of the first cell, metres."""
+    cell: float
+    """Edge of a cell, metres."""
+    parts: UInt8[ndarray, "x y z"]
+    """Distance from the surface in sixteenths of a cell, rounded down; at most REACH cells, 0 in and beside occupied cells."""
+
+    @staticmethod
+    def of(surface: SurfaceMesh, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], cell: float = CELL) -> Clearance:
+        """The clearance of a surface in and around a box.
+
+        Args:
+            surface: the mesh, in metres.
+            lower: corner of the box, m.
+            upper: opposite corner of the box, m.
+            cell: edge of a cell in metres; it grows where there would be more than MAX_CELLS.
+        """
+        lower, size = np.asarray(lower, np.float64), np.asarray(upper, np.float64) - np.asarray(lower, np.float64)
+        while math.prod((size / cell + 2 * REACH + 1).tolist()) > MAX_CELLS:
+            cell *= 1.05
+        start = lower - REACH * cell
+        occupied = np.zeros((np.ceil(size / cell).astype(int) + 2 * REACH).tolist(), np.bool_)
+        vertices = (surface.vertices.numpy(force=True).astype(np.float64) - start) / cell
+        _occupy(vertices, surface.triangles.numpy(force=True), occupied)
+        return Clearance(start, float(cell), _parts(occupied))
+
+    def near(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], room: float = 0.0) -> Int[ndarray, " c"]:
+        """Indices of the straight paths that may come within `room` of the surface, ascending; all others cannot.
+
+        A path of no length counts as free, and one outside of the map does not.
+
+        Args:
+            start: of each path, m.
+            stop: end of each path, m.
+            room: m.
+        """
+        return _near(start, stop, room, self.lower, self.cell, self.parts)
+
+
+@numba.njit(cache=True, nogil=True)
+def _occupy(vertices, triangles, occupied):
+    """Mark the cells of all triangles; vertices in cells.
+
+    In the plan across the axis of a triangle's largest normal component, squares are left out that an edge separates from it.
+    Along that axis the plane of the triangle bounds the cells.
+    """
+    shape = occupied.shape
+    at, low, high, normal = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    begin, end, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    half = 0.5 + ROOM
+    for f in range(len(triangles)):
+        outside, several = False, 0
+        for axis in range(3):
+            a, b, c = vertices[triangles[f, 0], axis], vertices[triangles[f, 1], axis], vertices[triangles[f, 2], axis]
+            at[0, axis], at[1, axis], at[2, axis] = a, b, c
+            low[axis], high[axis] = min(a, b, c) - ROOM, max(a, b, c) + ROOM
+            if not (high[axis] >= 0.0 and low[axis] < shape[axis]):
+                outside = True
+                break
+            begin[axis], end[axis] = int(max(low[axis], 0.0)), int(min(high[axis], shape[axis] - 1.0))
+            several += end[axis] > begin[axis]
+        if outside:
+            continue
+        if several <= 1:  # a row of cells
+            for i in range(begin[0], end[0] + 1):
+                for j in range(begin[1], end[1] + 1):
+                    for k in range(begin[2], end[2] + 1):
+                        occupied[i, j, k] = True
+            continue
+        deep = 0
+        for axis in range(3):
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            normal[axis] = (at[1, u] - at[0, u]) * (at[2, v] - at[0, v]) - (at[1, v] - at[0, v]) * (at[2, u] - at[0, u])
+            if abs(normal[axis]) > abs(normal[deep]):
+                deep = axis
+        u, v = (deep + 1) % 3, (deep + 2) % 3
+        flat = normal[deep] != 0.0  # a triangle without area occupies all cells of its box
+        slope_u, slope_v = (-normal[u] / normal[deep], -normal[v] / normal[deep]) if flat else (0.0, 0.0)
+        thick = (abs(slope_u) + abs(slope_v)) * half + ROOM
+        for i in range(begin[u], end[u] + 1):
+            for j in range(begin[v], end[v] + 1):
+                lowest, highest = begin[deep], end[deep]
+                if flat:
+                    apart = False
+                    for edge in range(3):
+                        other = (edge + 1) % 3
+                        edge_u, edge_v = at[other, u] - at[edge, u], at[other, v] - at[edge, v]
+                        side = edge_u * (j + 0.5 - at[edge, v]) - edge_v * (i + 0.5 - at[edge, u])  # positive inside
+                        if normal[deep] < 0.0:
+                            side = -side
+                        apart |= side + (abs(edge_u) + abs(edge_v)) * half < 0.0
+                    if apart:
+                        continue
+                    middle = at[0, deep] + slope_u * (i + 0.5 - at[0, u]) + slope_v * (j + 0.5 - at[0, v])
+                    lowest = max(lowest, math.floor(max(middle - thick, -1.0)))
+                    highest = min(highest, math.floor(min(middle + thick, shape[deep] + 1.0)))
+                for k in range(lowest, highest + 1):
+                    place[u], place[v], place[deep] = i, j, k
+                    occupied[place[0], place[1], place[2]] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _parts(occupied):
+    """Clearance of all cells: with d cells from one to the other along an axis, |d| - 1 lie between them."""
+    nx, ny, nz = occupied.shape
+    far = np.uint8(REACH * REACH)
+    now = np.where(occupied, np.uint8(0), far)
+    grown = now.copy()
+    for axis in range(3):
+        if axis > 0:
+            grown[:] = now
+        for d in range(-REACH, REACH + 1):
+            between = np.uint8(max(abs(d) - 1, 0) ** 2)
+            dx, dy, dz = d if axis == 0 else 0, d if axis == 1 else 0, d if axis == 2 else 0
+            for x in range(max(0, -dx), min(nx, nx - dx)):
+                for y in range(max(0, -dy), min(ny, ny - dy)):
+                    own, other = grown[x, y, max(0, -dz) : min(nz, nz - dz)], now[x + dx, y + dy, max(0, dz) : min(nz, nz + dz)]
+                    for z in range(len(own)):
+                        own[z] = min(own[z], np.uint8(other[z] + between))
+        now, grown = grown, now
+    parts = np.empty(256, np.uint8)
+    for square in range(256):
+        parts[square] = math.floor(PARTS * min(math.sqrt(square), float(REACH)))
+    found = np.empty((nx, ny, nz), np.uint8)
+    flat, squares = found.reshape(-1), now.reshape(-1)
+    for c in range(len(flat)):
+        flat[c] = parts[squares[c]]
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _near(start, stop, room, lower, cell, parts):
+    found, count = np.empty(len(start), np.int64), 0
+    inverse, part = np.float32(1.0 / cell), np.float32(cell / PARTS)
+    low_x, low_y, low_z = np.float32(lower[0] / cell), np.float32(lower[1] / cell), np.float32(lower[2] / cell)
+    nx, ny, nz = parts.shape
+    for n in range(len(start)):
+        x, y, z = start[n, 0], start[n, 1], start[n, 2]
+        way_x, way_y, way_z = stop[n, 0] - x, stop[n, 1] - y, stop[n, 2] - z
+        square = way_x * way_x + way_y * way_y + way_z * way_z
+        gone, length = np.float32(0.0), np.float32(-1.0)
+        while True:
+            i, j, k = int(x * inverse - low_x), int(y * inverse - low_y), int(z * inverse - low_z)
+            if i < 1 or j < 1 or k < 1 or i >= nx or j >= ny or k >= nz:
+                clear = np.float32(-1.0)
+            else:
+                clear = parts[i, j, k] * part - room
+            if length < 0.0:
+                if (clear > 0.0 and clear * clear > square) or square == 0.0:
+                    break
+                length = np.float32(math.sqrt(square))
+            gone += clear
+            if clear > 0.0 and gone > length:
+                break
+            if not clear > 0.0:
+                found[count] = n
+                count += 1
+                break
+            share = gone / length
+            x, y, z = start[n, 0] + share * way_x, start[n, 1] + share * way_y, start[n, 2] + share * way_z
+    return found[:count].copy()
