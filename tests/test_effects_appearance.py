@@ -67,12 +67,13 @@ def test_patches_have_the_volume_of_the_snow_they_stand_for():
 
 
 def test_a_time_lapse_makes_patches_wider_not_thicker():
-    faster = replace(SNOWFALL.surface, accumulation_speedup=4 * SNOWFALL.surface.accumulation_speedup)
+    thin = replace(SNOWFALL.surface, layer_thickness=0.002)
+    faster = replace(thin, accumulation_speedup=4 * thin.accumulation_speedup)
     free = Landed()
-    free.rest_extents, free.represents = torch.full((2000,), 10.0), Landed.represents / 15
+    free.rest_extents, free.represents = torch.full((2000,), 10.0), Landed.represents / 200
     plain = replace(SNOWFALL.appearance, collided=replace(SNOWFALL.appearance.collided, scale_spread=0.0))
     flakes = replace(SNOWFALL, appearance=plain)
-    slow, fast = (initial_look(replace(flakes, surface=layer), free).collided.scales for layer in (SNOWFALL.surface, faster))
+    slow, fast = (initial_look(replace(flakes, surface=layer), free).collided.scales for layer in (thin, faster))
     torch.testing.assert_close(fast / slow, torch.tensor([2.0, 2.0, 1.0]).expand(2000, 3), rtol=1e-4, atol=0)
 
 
