@@ -75,14 +75,14 @@ class SurfaceResponse:
     """Water in mm (kg/m^2) that makes 63 % of a dry surface look wet. Pores take up about 0.1 mm, and more changes nothing."""
     puddles: bool = True
     """Whether water that wets runs off and stands where the ground is level or hollow."""
-    unevenness: float = 0.003
+    unevenness: float = 0.005
     """Standard deviation in metres of the height of level ground below what its mesh resolves. Paving is laid to about a
     centimetre in four metres, and puddles form in what is left."""
     ripples: bool = True
     """Whether drops make rings on standing water."""
     mirror: bool = True
     """Whether wet and standing surfaces mirror the scene; False: the even sky alone."""
-    sheen: float = 2.5
+    sheen: float = 3.0
     """Factor on the light that wet and standing surfaces mirror. 1 is Fresnel's law; more shows at first sight what is water,
     also where it mirrors dark walls."""
     drips: bool = True

@@ -24,17 +24,21 @@ from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.response.coating import falling_mass, rained
+from pgsd_nerfstudio.response.crowns import crowns_of
 from pgsd_nerfstudio.response.exposure import Exposure
-from pgsd_nerfstudio.response.light import mirrored
+from pgsd_nerfstudio.response.impacts import Impacts
+from pgsd_nerfstudio.response.light import leafy, mirrored
 from pgsd_nerfstudio.response.mirrored_scene import MirroredScene
 from pgsd_nerfstudio.response.ring_arcs import arcs_of
 from pgsd_nerfstudio.response.ripples import Ripples, tilted
+from pgsd_nerfstudio.response.sky import overcast
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
-from pgsd_nerfstudio.scene.gaussians import Gaussians
+from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 
 WATER = 1000.0  # kg/m^3
 FULL = 0.0006  # m of water under which nothing of the ground stands out
+GREEN = 0.4  # likeness to leaves (light.leafy) of ground that water does not cover
 SUNK = 0.03  # m; Gaussians this near to the ground are part of it
 SMOOTH_FILM = 0.6  # light that a film on wet level ground mirrors, relative to standing water
 STEEP, LEVEL = 0.75, 0.95  # upward part of a normal up to which no film mirrors, and from which it does in full
@@ -70,8 +74,10 @@ class Puddles:
     """Of the Gaussians that are the ground of hollows, in metres along x and y."""
     bottom_ids: Int[ndarray, " b"]
     """Their numbers."""
+    impacts: Impacts | None = None
+    """Of the drops of a simulation; None: nothing falls."""
     ripples: Ripples | None = None
-    """Rings of the drops of a simulation; None: still water."""
+    """Rings of these drops; None: still water."""
 
     @staticmethod
     def of(
@@ -95,7 +101,8 @@ class Puddles:
         at = metric.means.double().numpy()
         basin, floor = ground.under(at[:, :2])
         part = np.abs(at[:, 2] - ground.height(at[:, :2], floor)) < SUNK
-        part &= ~exposure.loose.numpy()
+        # Blades of grass stand out of water that stands between them.
+        part &= ~exposure.loose.numpy() & (leafy(linear(metric.colors)).numpy() < GREEN)
         bottom = np.flatnonzero(part & (basin >= 0) & (metric.opacities.numpy() > 0.3))
         return Puddles(
             effect=effect,
@@ -127,8 +134,9 @@ class Puddles:
         return replace(self, **tensors, bottom=bottom, bottom_ids=number[self.bottom_ids[left]])
 
     def struck_by(self, history: ParticleHistory) -> Puddles:
-        """The same puddles with the rings of a simulation's drops."""
-        return replace(self, ripples=Ripples.of(history, self.ground, self.effect.material))
+        """The same puddles with the rings and crowns of a simulation's drops."""
+        impacts = Impacts.of(history)
+        return replace(self, impacts=impacts, ripples=Ripples.of(impacts, self.ground, self.effect.material))
 
     def seen(self, points: Float[Tensor, "m 3"], directions: Float[Tensor, "m 3"], weather: float) -> Float[Tensor, "m 3"]:
         """Linear light that water mirrors: that of the scene, or of the even sky alone.
@@ -214,8 +222,8 @@ class PuddlesNow:
             light[bright] = share[bright, None] * seen.to(towards)
         return light, share
 
-    def rings(self, view: Viewpoint, below: Below, weather: float) -> Gaussians | None:
-        """The rings near a camera as Gaussians in scene units; None if it sees none.
+    def drawn(self, view: Viewpoint, below: Below, weather: float) -> Gaussians | None:
+        """The rings and crowns of drops near a camera as Gaussians in scene units; None if it sees none.
 
         Args:
             view: the camera, in scene units.
@@ -223,10 +231,20 @@ class PuddlesNow:
             weather: share of the full weather, 0..1.
         """
         puddles = self.puddles
-        if puddles.ripples is None or not puddles.rippling or len(puddles.bottom_ids) == 0:
-            return None
         one = Cameras(view.viewmat.cpu().float()[None], view.K.cpu().float()[None], view.width, view.height)
         camera = puddles.frame.cameras_to_metric(one)
+        parts = [self._rings(camera, below, weather)]
+        if puddles.impacts is not None and puddles.effect.surface.splash is not None:
+            white = overcast(torch.ones(1), (puddles.effect.ambience or Ambience()).sky)[0]
+            parts.append(crowns_of(puddles.impacts, self.seconds, camera, encoded(white), puddles.effect.appearance.legibility))
+        found = [part for part in parts if part is not None and len(part)]
+        return puddles.frame.gaussians_to_scene(concatenate(found)).to(view.viewmat.device) if found else None
+
+    def _rings(self, camera: Cameras, below: Below, weather: float) -> Gaussians | None:
+        """The rings near a camera in metres."""
+        puddles = self.puddles
+        if puddles.ripples is None or not puddles.rippling or len(puddles.bottom_ids) == 0:
+            return None
         arcs = arcs_of(puddles.ripples, self.seconds, camera, float(puddles.ground.level[0]))
         basin, floor = puddles.ground.under(arcs.places)
         depth = depth_over(self.pools, basin, floor)
@@ -245,8 +263,7 @@ class PuddlesNow:
         seen = puddles.seen(points, reflected(towards, normals), weather)
         ground = linear(below(torch.from_numpy(puddles.bottom_ids[nearest[kept]])).cpu())
         light = (1 - fresnel)[:, None] * ground + fresnel[:, None] * seen
-        drawn = arcs.gaussians(points + TOWARDS * towards, torch.from_numpy(share).float(), encoded(light))
-        return puddles.frame.gaussians_to_scene(drawn).to(view.viewmat.device)
+        return arcs.gaussians(points + TOWARDS * towards, torch.from_numpy(share).float(), encoded(light))
 
 
 Below = Callable[[Int[Tensor, " k"]], Float[Tensor, "k 3"]]

@@ -83,7 +83,7 @@ def arcs_of(ripples: Ripples, seconds: float, camera: Cameras, height: float) ->
     radii, slopes = (table[numbers, row] for table in crests())
     slopes = ripples.depths[first:last, None] * slopes
     apart = np.abs(radii[:, 0] - radii[:, 1])
-    pixels = _pixels_per_metre(places, camera, height)
+    pixels = pixels_per_metre(np.concatenate([places, np.full((len(places), 1), height)], 1), camera)
     steep = np.abs(slopes).max(1)
     worth = np.where(pixels * apart > FINEST, pixels * steep * radii.mean(1), 0.0)
     best = np.argsort(-worth)[:MOST_RINGS]
@@ -104,10 +104,10 @@ def arcs_of(ripples: Ripples, seconds: float, camera: Cameras, height: float) ->
     )
 
 
-def _pixels_per_metre(places: Float[ndarray, "n 2"], camera: Cameras, height: float) -> Float[ndarray, " n"]:
-    """Scale of the picture at places on the ground, 0 where the camera does not see them."""
+def pixels_per_metre(places: Float[ndarray, "n 3"], camera: Cameras) -> Float[ndarray, " n"]:
+    """Scale of the picture at places in metres, 0 where the camera does not see them."""
     viewmat, K = camera.viewmats[0].double().numpy(), camera.Ks[0].double().numpy()
-    at = np.concatenate([places, np.full((len(places), 1), height), np.ones((len(places), 1))], 1) @ viewmat.T
+    at = places @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = at[:, 2].clip(1e-3)
     x, y = K[0, 0] * at[:, 0] / depth + K[0, 2], K[1, 1] * at[:, 1] / depth + K[1, 2]
     wide, high = MARGIN * camera.width, MARGIN * camera.height

@@ -13,10 +13,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from pgsd_nerfstudio.effects.matter import Material
-from pgsd_nerfstudio.physics.bodies import SPLASHED
 from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
 from pgsd_nerfstudio.physics.laws.water_waves import Ring, crater_depth
-from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.response.impacts import Impacts
 
 SPREADS = (0.0018, 0.0030, 0.0048)  # m; craters of the tables
 CRATER = 1.3  # spread of a crater relative to the diameter of its drop
@@ -24,8 +23,6 @@ WAVES = 0.05  # share of an impact's energy that goes into waves; a drop leaves 
 DEPTH = 0.006  # m, of the water of all rings
 SECONDS, RADIUS, DT, DR = 0.7, 0.3, 0.0015, 0.0015  # length, reach and steps of the tables
 NEAR_GROUND = 0.03  # m; a drop that ends so near to the ground of a hollow has fallen into it
-COPIES = 6  # rings of one simulated drop at most, which stands for many
-APART = 0.35  # m around it in which the others that it stands for fall
 STEEPEST = 0.5  # slope that linear waves do not exceed here
 BIN = 0.12  # m; edge of the squares by which points near a ring are found
 
@@ -44,47 +41,20 @@ class Ripples:
     """Number of the table of each ring."""
 
     @staticmethod
-    def of(history: ParticleHistory, water: StandingWater, material: Material) -> Ripples:
-        """The rings of the drops of a simulation that fell into hollows.
-
-        A drop falls while its last step lasts: as much of a frame as that step is long, relative to the step before. The other
-        real drops that it represents fall around it within the time of a frame.
+    def of(impacts: Impacts, water: StandingWater, material: Material) -> Ripples:
+        """The rings of the drops that fell into hollows.
 
         Args:
-            history: of the drops.
+            impacts: of drops.
             water: the hollows.
             material: gives the mass of a drop.
         """
-        ends, births = history.ends.numpy(force=True).astype(np.int64), history.births.numpy(force=True)
-        last = history.offsets[1:].numpy(force=True) - 1
-        falls = (ends < history.frames) & ~history.collided.numpy(force=True) & (ends - births > 2)
-        falls &= (history.kinds.numpy(force=True) & SPLASHED) == 0
-        which = np.flatnonzero(falls)
-        positions = history.positions.numpy(force=True)
-        at = positions[last[which]].astype(float)
-        basin, floor = water.under(at[:, :2])
-        hits = (basin >= 0) & (np.abs(at[:, 2] - water.height(at[:, :2], floor)) < NEAR_GROUND)
-        which, at = which[hits], at[hits]
-        rows = last[which]
-        step = positions[rows - 1].astype(float) - positions[rows - 2]
-        length = np.linalg.norm(step, axis=1).clip(1e-9)
-        part = (np.linalg.norm(at - positions[rows - 1], axis=1) / length).clip(0, 1)
-        seconds = (ends[which] - 2 + part) / history.fps
-        diameters = history.diameters.numpy(force=True)[which].astype(float)
-        energy = 0.5 * np.asarray(material.mass(diameters)) * (length * history.fps) ** 2 * WAVES
-        copies = np.round(history.represents.numpy(force=True)[which]).astype(int).clip(1, COPIES)
-        own = np.repeat(np.arange(len(which)), copies)
-        rng = np.random.default_rng(0x0717)
-        other = np.append(False, own[1:] == own[:-1]) if len(own) else np.zeros(0, bool)
-        radius, turn = APART * np.sqrt(rng.random(len(own))), 2 * np.pi * rng.random(len(own))
-        moved = np.where(other, radius, 0.0)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
-        spread = CRATER * diameters
-        table = np.abs(np.log(spread[:, None] / np.array(SPREADS))).argmin(1)
-        crater = crater_depth(energy, np.array(SPREADS)[table])
-        times = seconds[own] - np.where(other, rng.random(len(own)) / history.fps, 0.0)
-        order = np.argsort(times, kind="stable")
-        own = own[order]
-        return Ripples(times[order], (at[:, :2][own] + moved[order]), crater[own], table[own])
+        basin, floor = water.under(impacts.places[:, :2])
+        above = impacts.places[:, 2] - water.height(impacts.places[:, :2], floor)
+        hits = impacts.select((basin >= 0) & (np.abs(above) < NEAR_GROUND))
+        energy = WAVES * 0.5 * np.asarray(material.mass(hits.diameters)) * hits.speeds**2
+        table = np.abs(np.log(CRATER * hits.diameters[:, None] / np.array(SPREADS))).argmin(1)
+        return Ripples(hits.times, hits.places[:, :2], crater_depth(energy, np.array(SPREADS)[table]), table)
 
     def active(self, seconds: float) -> tuple[int, int]:
         """First and exclusive last number of the impacts whose rings move at a second."""
