@@ -272,7 +272,9 @@ class Shown:
             softening = self.answer.softening
             light = in_weather(light, effect.ambience, self.share, None if softening is None else softening[ids])
         if effect.surface.landing == "wets":
-            wet = wet_share(light, self.wet[ids])
+            # Water that stands has run there from where it fell.
+            soaked = self.wet if self.puddles is None else torch.maximum(self.wet, self.puddles.share.to(self.wet))
+            wet = wet_share(light, soaked[ids])
             if not edited:
                 light = darkened(light, wet)
                 light = light if self.puddles is None else under_water(light, self.puddles.share[ids].to(light) * wet[:, 0])

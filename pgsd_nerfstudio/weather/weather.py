@@ -223,6 +223,7 @@ class Weather:
         """As `open`, with a scene that is on its device already; its metric frame is replaced by the stored one."""
         parts, frame = open_parts(Path(folder).expanduser(), prepared.scene)
         prepared = replace(prepared, scene=replace(prepared.scene, frame=frame))
-        history, answer = parts.history.to(prepared.device), parts.answer.to(prepared.device)
+        history = parts.history.to(prepared.device)
+        answer = parts.answer.to(prepared.device).struck_by(history)
         answer = answer.beside(history.about.get("sharpness"))
         return Weather(prepared, parts.effect, parts.options, history, answer)
