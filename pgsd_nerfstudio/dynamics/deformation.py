@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -26,6 +25,7 @@ from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
 from pgsd_nerfstudio.dynamics.state import Deltas, turned
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
@@ -185,7 +185,7 @@ class DeformedCloud(GaussianSequence):
 
 
 def _deltas(before: _Deformed, now: _Deformed) -> Deltas:
-    back = roma.quat_conjugation(roma.quat_wxyz_to_xyzw(before.quats))
-    rotation = roma.unitquat_to_rotvec(roma.quat_product(back, roma.quat_wxyz_to_xyzw(now.quats)))
+    back = rotations.quat_conjugation(rotations.quat_wxyz_to_xyzw(before.quats))
+    rotation = rotations.unitquat_to_rotvec(rotations.quat_product(back, rotations.quat_wxyz_to_xyzw(now.quats)))
     change = Change(*(b - a for a, b in zip(before.change, now.change, strict=True)))
     return Deltas(ActiveDelta(now.moved - before.moved, rotation, change), Change.none(0, now.moved))

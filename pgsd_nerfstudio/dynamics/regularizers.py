@@ -13,13 +13,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.look import LearnedLook
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
+from pgsd_nerfstudio.scene import rotations
 
 EPSILON = 1e-6
 APPEARANCE = tuple(f"{state}_{name}" for state in ("active", "collided") for name in ("opacity", "scale", "rgb"))
@@ -140,7 +140,7 @@ def rotation_angle(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Te
 
     Computed as 2 atan2 of the sine and cosine of the half angle: the arccos has an infinite gradient at equal orientations.
     """
-    between = roma.quat_product(roma.quat_conjugation(roma.quat_wxyz_to_xyzw(b)), roma.quat_wxyz_to_xyzw(a))
+    between = rotations.quat_product(rotations.quat_conjugation(rotations.quat_wxyz_to_xyzw(b)), rotations.quat_wxyz_to_xyzw(a))
     return 2 * torch.atan2(safe_norm(between[:, :3]), between[:, 3].abs())
 
 

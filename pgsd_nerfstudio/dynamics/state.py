@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -23,6 +22,7 @@ from pgsd_nerfstudio.dynamics.look import Change, accumulate, changed
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
+from pgsd_nerfstudio.scene import rotations
 
 LANDING_FRAMES = 5
 """Frames before contact over which all learned changes of an active particle fade out: it lands where and as the simulation
@@ -157,8 +157,8 @@ def advance(
 
 def turned(quats: Float[Tensor, "n 4"], rotation: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     """R o dR(omega): wxyz quaternions turned by rotation vectors in their own axes; exactly the same where those are zero."""
-    step = roma.rotvec_to_unitquat(rotation)
-    return roma.quat_xyzw_to_wxyz(roma.quat_product(roma.quat_wxyz_to_xyzw(quats), step))
+    step = rotations.rotvec_to_unitquat(rotation)
+    return rotations.quat_xyzw_to_wxyz(rotations.quat_product(rotations.quat_wxyz_to_xyzw(quats), step))
 
 
 def fading(history: ParticleHistory, frame: int, ids: Int[Tensor, " n"]) -> Float[Tensor, " n"]:

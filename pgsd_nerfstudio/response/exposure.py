@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
@@ -21,6 +20,7 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.laws.populations import fall_speed, number_density
 from pgsd_nerfstudio.response.rays import blocked, open_sky
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
@@ -91,7 +91,7 @@ def most_hidden(metric: Gaussians, exposure: Exposure, centers: Float[Tensor, "c
         exposure: of these Gaussians.
         centers: of the cameras in metres; None: all leaves are near.
     """
-    axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
+    axes = rotations.unitquat_to_rotmat(rotations.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
     height = (axes[:, 2] * metric.scales).norm(dim=1)
     low, high = UPRIGHT
     upright = ((height / metric.scales.amax(1) - low) / (high - low)).clamp(0, 1) * (height > TALL)
@@ -177,6 +177,6 @@ def _beneath(
 def _own_normals(metric: Gaussians) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
     """The direction of each Gaussian's thinnest axis, turned upwards, and whether it is flat."""
     order = metric.scales.sort(dim=1)
-    axes = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
+    axes = rotations.unitquat_to_rotmat(rotations.quat_wxyz_to_xyzw(torch.nn.functional.normalize(metric.quats, dim=1)))
     own = axes.gather(2, order.indices[:, :1, None].expand(-1, 3, 1))[:, :, 0]
     return own * torch.where(own[:, 2:] < 0, -1.0, 1.0), order.values[:, 0] < FLAT * order.values[:, 1]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import roma
 import torch
 from jaxtyping import Float
 from scipy.spatial import KDTree
@@ -23,6 +22,7 @@ from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.layer_making import CARRIES, Carriers
 from pgsd_nerfstudio.response.light import received
 from pgsd_nerfstudio.response.patchiness import fallen_until_hidden
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 NEIGHBOURS = 8  # frozen Gaussians whose share of the sky is averaged, since it is noisy by the number of rays
@@ -77,7 +77,7 @@ def _under_clouds(look: InitialLook, answer: Answer) -> InitialLook:
 
 def _held(quats: Float[Tensor, "n 4"], answer: Answer) -> Float[Tensor, " n"]:
     """1 where a surface holds particles, 0 where it is too steep; by their orientation at rest."""
-    up = roma.unitquat_to_rotmat(quats.roll(-1, 1))[:, 2, 2]
+    up = rotations.unitquat_to_rotmat(quats.roll(-1, 1))[:, 2, 2]
     slope = torch.rad2deg(torch.arccos(up.clamp(-1, 1)))
     return ((answer.effect.surface.holds_degrees + TOO_STEEP - slope) / TOO_STEEP).clamp(0, 1)
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -25,6 +24,7 @@ from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.response.coating import falling_mass
 from pgsd_nerfstudio.response.light import received
 from pgsd_nerfstudio.response.patchiness import covered_share, hidden_share
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
@@ -150,4 +150,4 @@ def upright(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     down = z < -1 + 1e-6
     quats = torch.stack([1 + z, -y, x, torch.zeros_like(x)], 1)
     quats[down] = torch.tensor([0.0, 1.0, 0.0, 0.0]).to(normals)
-    return roma.quat_normalize(quats)
+    return rotations.quat_normalize(quats)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -21,6 +20,7 @@ from pgsd_nerfstudio.response.exposure import OFF, RAYS, arrivals
 from pgsd_nerfstudio.response.layer import RIM, Layer
 from pgsd_nerfstudio.response.patchiness import ranks
 from pgsd_nerfstudio.response.rays import blocked, open_sky
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.frame import attention
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.scene import Scene
@@ -119,7 +119,7 @@ class Carriers(NamedTuple):
 
 
 def _axes(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(normalize(quats, dim=1)))
+    return rotations.unitquat_to_rotmat(rotations.quat_wxyz_to_xyzw(normalize(quats, dim=1)))
 
 
 def _sampled(surface: SurfaceMesh, center: Float[Tensor, "3"], fine: float, generator: torch.Generator) -> _Pieces:

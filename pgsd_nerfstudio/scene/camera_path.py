@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import roma
 import torch
 from torch import Tensor
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.cameras import Cameras, interpolate, level_axes
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.scene import Scene
@@ -36,8 +36,8 @@ def choose_views(cameras: Cameras, frame: Frame) -> tuple[int, int]:
     forward = torch.nn.functional.normalize(-frame.vectors_to_metric(poses[:, :3, 2]), dim=1)
     to_middle = torch.nn.functional.normalize(_looked_at(centers, forward) - centers, dim=1)
     aside = torch.rad2deg(torch.arccos((to_middle * forward).sum(1).clamp(-1.0, 1.0)))
-    rotations = poses[:, :3, :3]
-    turn = torch.rad2deg(roma.rotmat_geodesic_distance(rotations[:, None], rotations[None, :]))
+    turns = poses[:, :3, :3]
+    turn = torch.rad2deg(rotations.rotmat_geodesic_distance(turns[:, None], turns[None, :]))
     slope = (torch.rad2deg(torch.arcsin(-forward[:, 2].clamp(-1.0, 1.0))) - SLOPE).abs()
     cost = (turn - TURN).abs() + (aside + slope)[:, None] + (aside + slope)[None, :]
     cost.fill_diagonal_(float("inf"))
@@ -67,7 +67,7 @@ def slow_path(scene: Scene, *, frames: int, fps: float = 25.0, start: int = 0, v
     if not (0 <= first < len(cameras) and 0 <= last < len(cameras)):
         raise ValueError(f"views must lie in 0-{len(cameras) - 1}, the training views of this scene, got {first} {last}")
     poses = cameras.opengl()[[first, last], :3, :3]
-    turn = float(torch.rad2deg(roma.rotmat_geodesic_distance(poses[0], poses[1])))
+    turn = float(torch.rad2deg(rotations.rotmat_geodesic_distance(poses[0], poses[1])))
     whole = max(2, start + frames, round(turn / DEGREES_PER_SECOND * fps))
     return interpolate(cameras, first, last, whole)[slice(start, start + frames)]
 

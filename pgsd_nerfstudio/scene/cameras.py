@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from pgsd_nerfstudio.scene import rotations
 
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
@@ -101,8 +102,8 @@ def interpolate(cameras: Cameras, first: int, last: int, frames: int) -> Cameras
     """
     poses = cameras.opengl()[[first, last]]
     at = torch.linspace(0.0, 1.0, frames, dtype=poses.dtype, device=poses.device)
-    quats = roma.rotmat_to_unitquat(poses[:, :3, :3])
-    rotation = roma.unitquat_to_rotmat(roma.unitquat_slerp(quats[0], quats[1], at, shortest_arc=True))
+    quats = rotations.rotmat_to_unitquat(poses[:, :3, :3])
+    rotation = rotations.unitquat_to_rotmat(rotations.unitquat_slerp(quats[0], quats[1], at))
     center = torch.lerp(poses[0, :3, 3], poses[1, :3, 3], at[:, None])
     c2w = torch.cat([rotation, center[:, :, None]], dim=2)
     Ks = torch.lerp(cameras.Ks[first], cameras.Ks[last], at[:, None, None])

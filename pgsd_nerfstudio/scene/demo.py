@@ -148,7 +148,7 @@ def _model() -> Model:
     if (stored := load_tensors(path)) is not None:
         tensors = stored[0]
         vertices, triangles, foliage = (tensors.pop(name) for name in ("vertices", "triangles", "foliage"))
-        return Model(Gaussians(**tensors, antialiased=False), vertices, triangles, foliage)
+        return Model(Gaussians(**tensors, antialiased=False, whole=False), vertices, triangles, foliage)
     model = build()
     mesh = {"vertices": model.vertices, "triangles": model.triangles, "foliage": model.foliage}
     save_tensors(path, {**model.gaussians.tensors, **mesh})

@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
@@ -99,12 +99,12 @@ def _converted(
     """Gaussians in other axes: centres and displacements by the two functions, orientations by the rotation."""
     if gaussians.sh_degree:
         raise ValueError(f"only Gaussians of plain colour change frames, found SH colours of degree {gaussians.sh_degree}")
-    turn = roma.rotmat_to_unitquat(rotation.double()).to(gaussians.quats)  # xyzw
-    quats = roma.quat_product(turn.expand(len(gaussians), 4), roma.quat_wxyz_to_xyzw(gaussians.quats))
+    turn = rotations.rotmat_to_unitquat(rotation.double()).to(gaussians.quats)  # xyzw
+    quats = rotations.quat_product(turn.expand(len(gaussians), 4), rotations.quat_wxyz_to_xyzw(gaussians.quats))
     return replace(
         gaussians,
         means=points(gaussians.means),
-        quats=roma.quat_xyzw_to_wxyz(quats),
+        quats=rotations.quat_xyzw_to_wxyz(quats),
         scales=scales,
         displacements=None if gaussians.displacements is None else vectors(gaussians.displacements),
     )
@@ -267,4 +267,4 @@ def rotation_to_z(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     sine, cosine = axis.norm(), up @ z
     if sine < 1e-9:
         return torch.eye(3, dtype=up.dtype) if cosine > 0 else torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=up.dtype))
-    return roma.rotvec_to_rotmat(axis / sine * torch.atan2(sine, cosine))
+    return rotations.rotvec_to_rotmat(axis / sine * torch.atan2(sine, cosine))

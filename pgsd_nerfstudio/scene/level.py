@@ -6,11 +6,11 @@ the candidates; for each, the level at which most of that area lies is its plane
 
 from __future__ import annotations
 
-import roma
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 FLAT = 0.5  # a Gaussian has a normal if its shortest axis is at most so much of the next one
@@ -50,8 +50,8 @@ def upright(gaussians: Gaussians) -> Float64[Tensor, "3"] | None:
     flat = near & (scales[:, 0] <= FLAT * scales[:, 1])
     if int(flat.sum()) < 100:
         return None
-    turned = roma.unitquat_to_rotmat(
-        roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(gaussians.quats[some].double().cpu(), dim=1))
+    turned = rotations.unitquat_to_rotmat(
+        rotations.quat_wxyz_to_xyzw(torch.nn.functional.normalize(gaussians.quats[some].double().cpu(), dim=1))
     )
     normals = turned.gather(2, order[:, :1, None].expand(-1, 3, 1)).squeeze(2)[flat]
     # One huge Gaussian must not be a plane by itself.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import roma
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import sh_basis
 
@@ -34,7 +34,7 @@ def moved(gaussians: Gaussians, transform: Float64[Tensor, "4 4"]) -> Gaussians:
         raise ValueError("a transform must scale all directions alike; this one stretches or shears")
     # An ellipsoid is its own mirror image through its centre, so that a mirroring may be replaced by minus itself.
     rotation = turn if torch.linalg.det(turn) > 0 else -turn
-    x, y, z, w = roma.rotmat_to_unitquat(rotation).tolist()
+    x, y, z, w = rotations.rotmat_to_unitquat(rotation).tolist()
     by = gaussians.quats.new_tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     exact = gaussians.means.double() @ linear.T + shift
     movement = gaussians.displacements

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -23,6 +22,7 @@ from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, domain_of, s
 from pgsd_nerfstudio.physics.bodies import SLID, SPLASHED
 from pgsd_nerfstudio.physics.laws.fall_speeds import rain_fall_speed
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.courtyard.masonry import HALF, LAWN_LEVEL, WALL_HEIGHT, WALL_THICKNESS
 from pgsd_nerfstudio.scene.demo import FOCAL, demo_scene
@@ -56,7 +56,7 @@ def _snow(scene: Scene, surface: SurfaceMesh, quick: bool) -> Iterable[Record]:
     snow, frames = (replace(SNOWFALL, dense=None), 75) if quick else (SNOWFALL, 250)
     run = simulate_metric(surface, snow, Clock(frames=frames), domain_of(scene), progress=False)
     resting, covers = run.rest_positions[run.collided], run.rest_covers[run.collided]
-    foot = resting - snow.surface.settle * roma.unitquat_to_rotmat(run.rest_quats[run.collided].roll(-1, 1))[:, :, 2]
+    foot = resting - snow.surface.settle * rotations.unitquat_to_rotmat(run.rest_quats[run.collided].roll(-1, 1))[:, :, 2]
     foot[:, 2] -= covers
     found = surface.closest(foot)
     on = (found.distance <= 0.005).float().mean()

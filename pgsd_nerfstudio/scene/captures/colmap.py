@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import roma
 import torch
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.captures.capture import Capture, checked_poses
 from pgsd_nerfstudio.scene.captures.lenses import MODELS, READ, Lens, lens_of
 from pgsd_nerfstudio.scene.captures.photographs import Photograph, find_photographs
@@ -72,8 +72,9 @@ def read_colmap(folder: Path) -> Capture:
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
     numbers = torch.tensor([pose for _, _, pose in rows], dtype=torch.float64)
     lengths = numbers[:, :4].norm(dim=1, keepdim=True)
-    quaternions = roma.quat_wxyz_to_xyzw(numbers[:, :4] / lengths)  # of length 0: NaN, which is refused with its image's name
-    rotation = roma.unitquat_to_rotmat(quaternions).transpose(1, 2)  # camera to world
+    # One of length 0 becomes NaN, which is refused with its image's name.
+    quaternions = rotations.quat_wxyz_to_xyzw(numbers[:, :4] / lengths)
+    rotation = rotations.unitquat_to_rotmat(quaternions).transpose(1, 2)  # camera to world
     matrices[:, :3, :3] = rotation @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     matrices[:, :3, 3] = -(rotation @ numbers[:, 4:, None])[:, :, 0]
     poses = checked_poses(matrices, names, images)

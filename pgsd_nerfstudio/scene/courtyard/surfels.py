@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import roma
 import torch
 from numpy.typing import NDArray
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -301,7 +301,7 @@ def gaussians_of(patch: Patch, rgb: Array, opacity: Array) -> Gaussians:
     thin = THICKNESS * patch.size.min(axis=1, keepdims=True)
     return Gaussians(
         means=torch.from_numpy(patch.position).float(),
-        quats=roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation)).float(),
+        quats=rotations.quat_xyzw_to_wxyz(rotations.rotmat_to_unitquat(rotation)).float(),
         scales=torch.from_numpy(np.concatenate([patch.size, thin], axis=1)).float(),
         opacities=torch.from_numpy(opacity).float(),
         colors=torch.from_numpy((rgb[:, None, :] - 0.5) / SH_CONSTANT).float(),

@@ -17,10 +17,10 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
+from pgsd_nerfstudio.scene import rotations
 from pgsd_nerfstudio.scene.errors import SceneError
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.similarity import moved
@@ -205,7 +205,7 @@ def _transform(node: dict) -> Tensor:
         return _numbers(node, "matrix", [0.0] * 16).reshape(4, 4).T
     transform = torch.eye(4, dtype=torch.float64)
     quaternion = torch.nn.functional.normalize(_numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0]), dim=0)
-    transform[:3, :3] = roma.unitquat_to_rotmat(quaternion) * _numbers(node, "scale", [1.0] * 3)
+    transform[:3, :3] = rotations.unitquat_to_rotmat(quaternion) * _numbers(node, "scale", [1.0] * 3)
     transform[:3, 3] = _numbers(node, "translation", [0.0] * 3)
     return transform
 
