@@ -64,7 +64,7 @@ class Impacts:
     def __len__(self) -> int:
         return len(self.times)
 
-    def select(self, which: ndarray) -> Impacts:
+    def select(self, which: ndarray | slice) -> Impacts:
         """The chosen impacts, by mask, index or slice."""
         return Impacts(*(getattr(self, f.name)[which] for f in fields(self)))
 
@@ -76,4 +76,4 @@ class Impacts:
             last: second.
         """
         begin, end = np.searchsorted(self.times, [first, last])
-        return self.select(slice(int(begin), int(end)))  # type: ignore[arg-type]
+        return self.select(slice(int(begin), int(end)))
