@@ -14,9 +14,12 @@ from pgsd_nerfstudio.physics.bodies import Bodies, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
 from pgsd_nerfstudio.physics.ground.dense import DenseMatter
+from pgsd_nerfstudio.physics.ground.drips import DRIPPED, Drips, after_film
 from pgsd_nerfstudio.physics.ground.wetness import WetnessGrid, Wetting
+from pgsd_nerfstudio.physics.laws.populations import MM_PER_HOUR
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
+WATER = 1000.0  # kg/m^3
 WETTEST = 2e5  # cells of wetness in the plan, at most; in larger scenes the cells grow
 
 
@@ -35,6 +38,8 @@ class Deposits:
         if response.landing == "wets":
             cell = max(Wetting().cell, (domain.area / WETTEST) ** 0.5)
             self.wetness = WetnessGrid.of(surface, domain, Wetting(cell=cell))
+        rains = response.landing == "wets" and effect.emission.precipitates and len(surface.triangles) > 0
+        self.drips = Drips.of(surface, domain) if rains and response.drips else None
         self.dense = DenseMatter(effect.dense, response, surface, domain) if effect.dense is not None and stays else None
         self.missed = 0.0
         """m^3 of layer, or kg of water, of particles that landed where no level or cell could hold it."""
@@ -67,14 +72,31 @@ class Deposits:
         height = self.cover.height(points)
         return np.maximum(height, self.cover.above(points)) if heaped else height
 
+    def dripping(self, before: float, after: float) -> tuple[Float[ndarray, "d 3"], Float[ndarray, " d"]]:
+        """Where drops let go of edges between two seconds, in metres, and how many real drops each stands for.
+
+        Args:
+            before: second.
+            after: second.
+        """
+        if self.drips is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        effect = self.effect
+        rate = effect.emission.intensity * MM_PER_HOUR / WATER
+        fallen = (rate * effect.timeline.fallen(seconds) for seconds in (before, after))
+        ran = (after_film(metres, effect.surface.accumulation_speedup) for metres in fallen)
+        edges, stands_for = self.drips.falling(*ran, rate)
+        return self.drips.places[edges], stands_for
+
     def wet(self, bodies: Bodies, share: Float[ndarray, " n"]) -> None:
-        """Add water of drops to the wetness.
+        """Add water of drops to the wetness. Water that drips from an edge has wetted what is above already.
 
         Args:
             bodies: drops at their contacts.
             share: of each drop's water that is added, 0-1.
         """
         if self.wetness is not None and len(bodies):
+            share = np.where(bodies.kinds & DRIPPED, 0.0, share)
             self.missed += self.wetness.deposit(bodies.positions.astype(np.float64), share * self.masses(bodies))
 
     def age(self, seconds: float) -> None:

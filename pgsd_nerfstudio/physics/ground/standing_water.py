@@ -94,9 +94,9 @@ class StandingWater:
         x, y = (lower[k] + cell * np.arange(shape[k]) for k in range(2))
         at = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         top = domain.upper[2]
-        ground = _below(surface, at, np.full(len(at), top))
+        ground = heights_below(surface, at, np.full(len(at), top))
         level = _level(at, ground)
-        sheltered = _below(surface, at, level[0] + at @ level[1:] + UNDER)
+        sheltered = heights_below(surface, at, level[0] + at @ level[1:] + UNDER)
         roofed = (ground > level[0] + at @ level[1:] + 1.5 * UNDER) & np.isfinite(sheltered)
         ground = np.where(roofed, sheltered, ground).reshape(shape)
         plane = (level[0] + at @ level[1:]).reshape(shape)
@@ -123,7 +123,7 @@ class StandingWater:
         known = np.isfinite(ground)
         heights = np.where(known, ground, -np.inf)
         drains = np.full(ground.shape, -np.inf)  # height above which a cell drains into the soil; -inf: it does not
-        filled, parent, order = _flood(heights, drains)
+        filled, parent, order = flood(heights, drains)
         for _ in range(_ROUNDS):
             deep = known & (filled > heights + DEEPEST * 1.0001)
             labels, count = ndimage.label(deep, np.ones((3, 3)))
@@ -131,7 +131,7 @@ class StandingWater:
                 break
             lowest = np.array(ndimage.minimum_position(heights, labels, np.arange(1, count + 1)))
             drains[tuple(lowest.T)] = heights[tuple(lowest.T)] + DEEPEST
-            filled, parent, order = _flood(heights, drains)
+            filled, parent, order = flood(heights, drains)
         basin, count = _basins(known & (filled > heights), filled, cell, order)
         rained_on = known if under_sky is None else known & under_sky
         into, catchment = _ways(basin.reshape(-1), parent, order, rained_on.reshape(-1), count)
@@ -239,8 +239,14 @@ def depth_over(pools: Pools, basin: Int[ndarray, " n"], floor: Float[ndarray, " 
     return np.where(wet, pools.levels[basin] - floor, -1.0)
 
 
-def _below(surface: SurfaceMesh, at: Float[ndarray, "n 2"], start: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
-    """Height of the first surface below places and heights, m; NaN where there is none or where its underside is met."""
+def heights_below(surface: SurfaceMesh, at: Float[ndarray, "n 2"], start: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
+    """Height of the first surface below places, m; NaN where there is none or where its underside is met.
+
+    Args:
+        surface: the mesh in metres.
+        at: places, m.
+        start: heights above them, m.
+    """
     origins = np.concatenate([at, start[:, None]], 1).astype(np.float32)
     hits = surface.cast(origins, np.broadcast_to(np.float32([0, 0, -1]), origins.shape).copy())
     distance, upward = hits.distance.numpy().astype(np.float64), hits.normal.numpy()[:, 2] > 0
@@ -340,8 +346,12 @@ def _basins(
 
 
 @numba.njit(cache=True)
-def _flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+def flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Flood a map from its border, from unknown cells (-inf) and from drains upward.
+
+    Args:
+        heights: [x, y] m.
+        drains: [x, y] height above which a cell drains, m; -inf: it does not.
 
     Returns:
         The filled heights; the cell, as a flat index, from which the flood reached each cell, -1 for an outlet; and all cells
