@@ -33,7 +33,7 @@ def test_the_edges_of_a_table_get_the_rain_of_its_whole_top():
     drips = Drips.on(heights, np.zeros(2), 0.03)
     assert drips.areas.sum() == pytest.approx((heights > 0.3).sum() * 0.03**2)
     assert (drips.places[:, 2] < 0.7).all() and (drips.places[:, 2] > 0.6).all()
-low, high = drips.places[:, 0] > 1.1, drips.places[:, 0] < 0.7
+    low, high = drips.places[:, 0] > 1.1, drips.places[:, 0] < 0.7
     assert drips.areas[low].sum() > 3 * drips.areas[high].sum()
 
 
@@ -43,9 +43,7 @@ def test_what_has_come_to_an_edge_has_dripped_but_for_less_than_a_drop():
         hanging = drips.areas * metres / DROP - drips.dripped(metres, RATE)
         assert ((hanging >= 0) & (hanging < 1)).all()
     steps = np.linspace(0, 1e-3, 37)
-    fell = sum(
-        stands_for.sum() for _, stands_for in (drips.falling(a, b, RATE) for a, b in pairwise(steps))
-    )
+    fell = sum(stands_for.sum() for _, stands_for in (drips.falling(a, b, RATE) for a, b in pairwise(steps)))
     assert fell == drips.dripped(1e-3, RATE).sum()
 
 

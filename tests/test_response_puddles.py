@@ -26,7 +26,7 @@ from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 RED = (0.8, 0.2, 0.2)
-DEEP = replace(RAINFALL, surface=replace(RAINFALL.surface, sheen=1.0))
+DEEP = replace(RAINFALL, appearance=replace(RAINFALL.appearance, legibility=1.0))
 
 
 def _wall() -> SurfaceMesh:
@@ -93,9 +93,10 @@ def test_a_mirrored_direction_is_as_steep_as_the_view_and_never_below_the_horizo
     assert (reflected(towards, tilted(np.full((100, 2), 0.5)))[:, 2] > 0).all()
 
 
-def test_more_sheen_mirrors_more_and_never_more_than_all():
+def test_legible_water_mirrors_more_and_never_more_than_all():
     towards = torch.tensor([0.0, -np.sin(1.45), np.cos(1.45)]).float()
-    light = [_mirror(_puddles(replace(RAINFALL, surface=replace(RAINFALL.surface, sheen=s))), towards) for s in (1.0, 2.0, 9.0)]
+    looks = [replace(RAINFALL.appearance, legibility=legibility) for legibility in (1.0, 4.0, 81.0)]
+    light = [_mirror(_puddles(replace(RAINFALL, appearance=look)), towards) for look in looks]
     assert light[1][1].mean() == pytest.approx(min(2 * float(light[0][1].mean()), 1.0), rel=1e-5)
     assert light[2][1].max() <= 1.0
 

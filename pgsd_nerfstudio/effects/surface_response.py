@@ -82,9 +82,6 @@ class SurfaceResponse:
     """Whether drops make rings on standing water."""
     mirror: bool = True
     """Whether wet and standing surfaces mirror the scene; False: the even sky alone."""
-    sheen: float = 3.0
-    """Factor on the light that wet and standing surfaces mirror. 1 is Fresnel's law; more shows at first sight what is water,
-    also where it mirrors dark walls."""
     drips: bool = True
     """Whether water gathers and drips from the edges of what stands above the ground, such as tables and benches."""
     splash: Splash | None = None
@@ -98,7 +95,5 @@ class SurfaceResponse:
         for name in ("accumulation_speedup", "layer_density", "layer_thickness", "hides", "darkens"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
-        if not self.sheen >= 0:
-            raise ValueError(f"sheen must not be negative, got {self.sheen:g}")
         if not self.unevenness >= 0:
             raise ValueError(f"unevenness must not be negative, got {self.unevenness:g} m")

@@ -157,8 +157,10 @@ class Puddles:
         return self.effect.surface.puddles and self.effect.surface.ripples
 
     def mirrored(self, cosine: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-        """Share of light that water mirrors, from the cosine to its normal: Fresnel's law times the sheen, at most 1."""
-        return (self.effect.surface.sheen * mirrored(cosine)).clamp_max(1.0) * (cosine > 0)
+        """Share of light that water mirrors, from the cosine to its normal: at a legibility of 1 Fresnel's law, else its
+        product with the root of the legibility, at most 1."""
+        sheen = self.effect.appearance.legibility**0.5
+        return (sheen * mirrored(cosine)).clamp_max(1.0) * (cosine > 0)
 
     def at(self, seconds: float) -> PuddlesNow:
         """The puddles at a second."""
