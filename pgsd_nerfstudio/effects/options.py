@@ -36,6 +36,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "accumulation_speedup": (0.001, 100_000.0, ""),
 }
 """Least and greatest value, and its unit; amount and size have a request's, the rest is judged by the parts of an Effect."""
+WATER = ("puddles", "ripples", "mirror", "drips")  # what rain leaves, each of which can be switched off
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,16 @@ class EffectOptions:
     accumulation: tyro.conf.FlagConversionOff[bool] = True
     """Whether what lands stays, gathers and wets. False: it vanishes, surfaces stay bare and dry."""
     accumulation_speedup: float | None = None
-    """Time lapse of the cover: what lands counts as so many times as much. By default the effect's own (snow 800, sand 60)."""
+    """Time lapse of cover and puddles: what lands counts as so many times as much. By default the effect's own (snow and rain
+    800, sand 60)."""
+    puddles: tyro.conf.FlagConversionOff[bool] = True
+    """Whether rain stands where the ground is level or hollow."""
+    ripples: tyro.conf.FlagConversionOff[bool] = True
+    """Whether drops make rings on standing water."""
+    mirror: tyro.conf.FlagConversionOff[bool] = True
+    """Whether wet and standing surfaces mirror the scene; False: an even sky alone."""
+    drips: tyro.conf.FlagConversionOff[bool] = True
+    """Whether water drips from the edges of tables and benches."""
     ambience: tyro.conf.FlagConversionOff[bool] = True
     """Whether light and sky follow the weather. False: they stay as captured."""
     exposure: float | None = None
@@ -211,6 +221,8 @@ class EffectOptions:
     def _surface(self, surface: SurfaceResponse) -> SurfaceResponse:
         if self.accumulation_speedup is not None:
             surface = replace(surface, accumulation_speedup=self.accumulation_speedup)
+        water = {name: getattr(surface, name) and getattr(self, name) for name in WATER}
+        surface = replace(surface, **water)
         if not self.accumulation and surface.landing == "wets":
             surface = replace(surface, landing="vanishes")  # drops still splash
         return surface
@@ -225,8 +237,12 @@ class EffectOptions:
             yield f"--haze and --haze-color change nothing: the air between the particles of {effect.name} is clear"
         if self.visibility != EffectOptions.visibility and effect.emission.precipitates:
             yield f"--visibility {self.visibility} changes nothing: {effect.name} is measured in {effect.emission.unit}"
-        if self.accumulation_speedup is not None and not (effect.surface.landing == "stays" and effect.surface.accumulates):
-            yield f"--accumulation-speedup {self.accumulation_speedup:g} changes nothing: {effect.name} leaves no layer here"
+        surface = effect.surface
+        stands = surface.landing == "wets" and surface.puddles and self.puddles
+        gathers = surface.accumulates if surface.landing == "stays" else stands
+        if self.accumulation_speedup is not None and not gathers:
+            lapse = f"--accumulation-speedup {self.accumulation_speedup:g}"
+            yield f"{lapse} changes nothing: {effect.name} leaves no layer and no puddles here"
 
 
 @lru_cache(maxsize=64)
