@@ -182,8 +182,14 @@ def test_words_for_what_vanishes_raise_no_cover_even_if_they_do_not_stay():
 def test_the_time_lapse_of_a_cover_can_be_set_where_there_is_one():
     assert turned("sandstorm", accumulation_speedup=7.0).surface == replace(SANDSTORM.surface, accumulation_speedup=7.0)
     assert said(effect="sandstorm", accumulation_speedup=7.0) == ""
-    for knobs in ({"effect": "rainfall"}, {"accumulation": False}):
+    assert turned("rainfall", accumulation_speedup=7.0).surface == replace(RAINFALL.surface, accumulation_speedup=7.0)
+    for knobs in ({"effect": "rainfall", "puddles": False}, {"accumulation": False}):
         assert "--accumulation-speedup 7 changes nothing" in said(accumulation_speedup=7.0, **knobs)
+
+
+@pytest.mark.parametrize("name", ["puddles", "ripples", "mirror", "drips"])
+def test_what_rain_leaves_can_be_switched_off(name):
+    assert turned("rainfall", **{name: False}).surface == replace(RAINFALL.surface, **{name: False})
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -285,7 +291,7 @@ FLAGS = (
     "--weather", "glittering green snow", "--intensity", "2.5", "--exposure", "0.01", "--amount", "1.5", "--size", "0.5",
     "--wind", "3", "--wind-direction", "-45", "--color", "#204060", "--haze-color", "lavender", "--haze", "0.5", "--onset", "1",
     "--ends", "9", "--visibility", "koschmieder", "--accumulation", "False", "--ambience", "False",
-    "--accumulation-speedup", "20",
+    "--accumulation-speedup", "20", "--puddles", "False", "--ripples", "False", "--mirror", "False", "--drips", "False",
 )  # fmt: skip
 
 
