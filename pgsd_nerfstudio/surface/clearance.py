@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-CELL = 0.05  # m; smallest edge of a cell
+CELL = 0.07  # m; smallest edge of a cell
 MAX_CELLS = 6_000_000  # a byte each; larger boxes have larger cells
 REACH = 8  # cells; distances beyond are not told apart
 PARTS = 16  # of a cell in which clearance is counted
+SLACK = 0.05  # parts of a cell by which clearance is less: rays are cast in float32
 ROOM = 1e-4  # cells by which a triangle may lie beside a cell that it occupies
 
 
@@ -48,10 +49,8 @@ class Clearance(NamedTuple):
         while math.prod((size / cell + 2 * REACH + 1).tolist()) > MAX_CELLS:
             cell *= 1.05
         start = lower - REACH * cell
-        occupied = np.zeros((np.ceil(size / cell).astype(int) + 2 * REACH).tolist(), np.bool_)
-        vertices = (surface.vertices.numpy(force=True).astype(np.float64) - start) / cell
-        _occupy(vertices, surface.triangles.numpy(force=True), occupied)
-        return Clearance(start, float(cell), _parts(occupied))
+        x, y, z = (np.ceil(size / cell).astype(int) + 2 * REACH).tolist()
+        return Clearance(start, float(cell), _parts(occupied_cells(surface, start, cell, (x, y, z))))
 
     def near(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], room: float = 0.0) -> Int[ndarray, " c"]:
         """Indices of the straight paths that may come within `room` of the surface, ascending; all others cannot.
@@ -64,6 +63,23 @@ class Clearance(NamedTuple):
             room: m.
         """
         return _near(start, stop, room, self.lower, self.cell, self.parts)
+
+
+def occupied_cells(
+    surface: SurfaceMesh, lower: Float[ndarray, "3"], cell: float, shape: tuple[int, int, int]
+) -> Bool[ndarray, "x y z"]:
+    """Cells of a box in which a triangle lies, and a few more that it nearly touches.
+
+    Args:
+        surface: the mesh, in metres.
+        lower: corner of the first cell, m.
+        cell: edge of a cell, m.
+        shape: cells along each axis.
+    """
+    occupied = np.zeros(shape, np.bool_)
+    vertices = (surface.vertices.numpy(force=True).astype(np.float64) - lower) / cell
+    _occupy(vertices, surface.triangles.numpy(force=True), occupied)
+    return occupied
 
 
 @numba.njit(cache=True, nogil=True)
@@ -130,10 +146,14 @@ def _occupy(vertices, triangles, occupied):
 
 @numba.njit(cache=True, nogil=True)
 def _parts(occupied):
-    """Clearance of all cells: with d cells from one to the other along an axis, |d| - 1 lie between them."""
+    """Clearance of all cells: with d cells from one to the other along an axis, |d| - 1 lie between them.
+
+    Outermost cells count as occupied, since nothing is known about what is beyond them.
+    """
     nx, ny, nz = occupied.shape
     far = np.uint8(REACH * REACH)
     now = np.where(occupied, np.uint8(0), far)
+    now[0], now[-1], now[:, 0], now[:, -1], now[:, :, 0], now[:, :, -1] = 0, 0, 0, 0, 0, 0
     grown = now.copy()
     for axis in range(3):
         if axis > 0:
@@ -149,7 +169,7 @@ def _parts(occupied):
         now, grown = grown, now
     parts = np.empty(256, np.uint8)
     for square in range(256):
-        parts[square] = math.floor(PARTS * min(math.sqrt(square), float(REACH)))
+        parts[square] = max(math.floor(PARTS * min(math.sqrt(square), float(REACH)) - SLACK), 0)
     found = np.empty((nx, ny, nz), np.uint8)
     flat, squares = found.reshape(-1), now.reshape(-1)
     for c in range(len(flat)):

@@ -136,9 +136,8 @@ def _balance(frames: int) -> Record:
 
 def _spread() -> Record:
     cells = 33
-    lattice = 0.05 * np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1).reshape(-1, 3)
     wetting = Wetting(diffusivity=2e-4, drying_seconds=math.inf)
-    grid = WetnessGrid([lattice], np.zeros(3), (cells, cells, cells), wetting)
+    grid = WetnessGrid(np.ones([cells + 2 * wetting.reach] * 3, bool), np.zeros(3), wetting)
     grid.deposit(np.full((1, 3), 0.8), np.array([1.0]))
     grid.step(20.0)
     variance = grid.water @ (grid.centres - 0.8) ** 2 / grid.held

@@ -133,21 +133,29 @@ def _node(place, last, zero):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _deflected(nodes, i, j, k, x, y, z, half, one):
-    """Change of the mean wind by obstacles: each component is quadratic along its own axis and linear along the others."""
+def _deflected(nodes, rows, i, j, k, x, y, z, half, one):
+    """Change of the mean wind by obstacles: each component is quadratic along its own axis and linear along the others.
+
+    `nodes` is one list of numbers; unsigned indices spare the check whether they count from its end.
+    """
     lx, ly, lz = (one - x, x), (one - y, y), (one - z, z)
     qx = (half * lx[0] * lx[0], half + x * lx[0], half * x * x)
     qy = (half * ly[0] * ly[0], half + y * ly[0], half * y * y)
     qz = (half * lz[0] * lz[0], half + z * lz[0], half * z * z)
     wind_x, wind_y, wind_z = one - one, one - one, one - one
+    first = np.uint64((i * rows[1] + j) * rows[2] + k) * np.uint64(3)
+    along_x, along_y = np.uint64(3 * rows[1] * rows[2]), np.uint64(3 * rows[2])
     for a in range(3):
         for b in range(2):
-            wind_x += qx[a] * ly[b] * (lz[0] * nodes[i + a, j + b, k, 0] + lz[1] * nodes[i + a, j + b, k + 1, 0])
-            wind_y += lx[b] * qy[a] * (lz[0] * nodes[i + b, j + a, k, 1] + lz[1] * nodes[i + b, j + a, k + 1, 1])
+            at = first + np.uint64(a) * along_x + np.uint64(b) * along_y
+            wind_x += qx[a] * ly[b] * (lz[0] * nodes[at] + lz[1] * nodes[at + np.uint64(3)])
+            at = first + np.uint64(b) * along_x + np.uint64(a) * along_y
+            wind_y += lx[b] * qy[a] * (lz[0] * nodes[at + np.uint64(1)] + lz[1] * nodes[at + np.uint64(4)])
     for a in range(2):
         for b in range(2):
-            column = nodes[i + a, j + b]
-            wind_z += lx[a] * ly[b] * (qz[0] * column[k, 2] + qz[1] * column[k + 1, 2] + qz[2] * column[k + 2, 2])
+            at = first + np.uint64(a) * along_x + np.uint64(b) * along_y + np.uint64(2)
+            column = qz[0] * nodes[at] + qz[1] * nodes[at + np.uint64(3)] + qz[2] * nodes[at + np.uint64(6)]
+            wind_z += lx[a] * ly[b] * column
     return wind_x, wind_y, wind_z
 
 
@@ -178,6 +186,7 @@ def _advance(position, velocity, speed, sway, hertz, phase, modes, constants, c,
     zero = half - half
     if nodes is not None:
         first_x, first_y, first_z, inverse, last_x, last_y, last_z = lattice
+        flat, rows = nodes.reshape(-1), nodes.shape
     for i in range(position.shape[0]):
         x = position[i, 0] + half * step * velocity[i, 0]
         y = position[i, 1] + half * step * velocity[i, 1]
@@ -198,13 +207,13 @@ def _advance(position, velocity, speed, sway, hertz, phase, modes, constants, c,
             lifted_y += modes[6, m] * sine
             if nodes is not None:
                 lifted_z += modes[8, m] * sine
-        profile = np.log1p(height / roughness)
+        profile = np.log(one + height / roughness)
         turns = hertz[i] * middle + phase[i]
         if nodes is not None:
             i_x, share_x = _node((x - first_x) * inverse, last_x, zero)
             i_y, share_y = _node((y - first_y) * inverse, last_y, zero)
             i_z, share_z = _node((height - first_z) * inverse, last_z, zero)
-            change_x, change_y, change_z = _deflected(nodes, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
+            change_x, change_y, change_z = _deflected(flat, rows, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
             if calmed[i_x, i_y, i_z]:
                 shelter, rise_x, rise_y, rise_z = _shelter(ramp, i_x, i_y, i_z, share_x, share_y, share_z, half, one)
                 change_x += inverse * calm * (rise_y * lifted_z + rise_z * lifted_x)

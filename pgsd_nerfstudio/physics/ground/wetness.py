@@ -1,7 +1,8 @@
 """Wetness of surfaces: a grid around them takes the water of drops, which spreads and dries.
 
-Only cells near the surface exist (the paper: "a coarse 3D grid surrounding the mesh"). They are one list of cells and a sparse
-matrix of neighbours, so memory follows the area of the surface and not the volume of the air: about 110 bytes a cell. Water
+Only cells near the surface exist (the paper: "a coarse 3D grid surrounding the mesh"). They are one list of cells with their
+neighbours, so memory follows the area of the surface and not the volume of the air: about 50 bytes a cell, and a byte for every
+point of the lattice while the list is made. Water
 diffuses between cells by the heat equation on that graph, dw/dt = (D / h^2) sum over neighbours (w_j - w_i); none of it leaves
 the cells. A step of any length is the exact exponential: inside the band the water of a point becomes the discrete Gaussian
 (Lindeberg 1990) whose variance is 2 D t along each axis. Drying takes the same share from all cells.
@@ -10,20 +11,19 @@ the cells. A step of any length is the exact exponential: inside the band the wa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.sparse import csr_array
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.ground.sampling import points_within
+from pgsd_nerfstudio.surface.clearance import occupied_cells
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-MAX_CELLS = 20_000_000  # 2.2 GB
+MAX_CELLS = 20_000_000  # 1 GB
 _TAIL = 1e-13  # share of a cell's water that a step may move too short a distance
 
 
@@ -51,17 +51,15 @@ class WetnessGrid:
 
     def __init__(
         self,
-        points: Iterable[Float[ndarray, "p 3"]],
+        occupied: Bool[ndarray, "x y z"],
         lower: Float[ndarray, "3"],
-        shape: tuple[int, int, int],
         wetting: Wetting,
     ):
-        """Make the cells within `Wetting.reach` of the surface.
+        """Make the cells within `Wetting.reach` of occupied ones.
 
         Args:
-            points: points that cover the surface, in pieces, m.
+            occupied: cells in which the surface lies, with `Wetting.reach` more of them on each side of the lattice.
             lower: first point of the lattice, m.
-            shape: lattice points along each axis.
             wetting: cell size and laws of spreading and drying.
 
         Raises:
@@ -69,8 +67,14 @@ class WetnessGrid:
         """
         self.wetting = wetting
         self.lower = np.asarray(lower, np.float64)
-        self.shape = shape
-        self.keys: Int[ndarray, " c"] = self._near(points)
+        x, y, z = (side - 2 * wetting.reach for side in occupied.shape)
+        self.shape = x, y, z
+        near = np.zeros(self.shape, np.bool_)
+        count = _grow(occupied, near, wetting.reach)
+        if count > MAX_CELLS:
+            edge = wetting.cell
+            raise ValueError(f"wetness needs at most {MAX_CELLS:,} cells, {edge:g} m make {count:,}; take larger cells")
+        self.keys: Int[ndarray, " c"] = near.ravel().nonzero()[0]
         self.water: Float[ndarray, " c"] = np.zeros(len(self.keys))  # kg
         self.deposited = 0.0  # kg so far
         self.evaporated = 0.0  # kg so far
@@ -88,11 +92,10 @@ class WetnessGrid:
             ValueError: there would be more than 20 million cells.
         """
         wetting = wetting or Wetting()
-        x, y, z = (math.ceil(edge / wetting.cell) + 1 for edge in domain.size)
-        lower, room = np.asarray(domain.lower, float), wetting.cell * (wetting.reach + 1)
-        upper = lower + wetting.cell * np.array([x, y, z])
-        points = points_within(surface, lower - room, upper + room, wetting.cell / 2)
-        return WetnessGrid(points, lower, (x, y, z), wetting)
+        x, y, z = (math.ceil(edge / wetting.cell) + 1 + 2 * wetting.reach for edge in domain.size)
+        lower = np.asarray(domain.lower, float)
+        corner = lower - wetting.cell * (wetting.reach + 0.5)  # a cell is centred on its lattice point
+        return WetnessGrid(occupied_cells(surface, corner, wetting.cell, (x, y, z)), lower, wetting)
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -110,8 +113,7 @@ class WetnessGrid:
     @property
     def bytes(self) -> int:
         """Memory of the grid in bytes."""
-        matrix = self._mixing
-        return sum(part.nbytes for part in (self.keys, self.water, matrix.data, matrix.indices, matrix.indptr))
+        return sum(part.nbytes for part in (self.keys, self.water, self._columns, self._neighbours))
 
     def deposit(self, points: Float[ndarray, "n 3"], mass: Float[ndarray, " n"]) -> float:
         """Add water at points, shared among the existing ones of the eight lattice points around each, with trilinear weights.
@@ -170,74 +172,123 @@ class WetnessGrid:
                 left -= weight
                 order += 1
                 weight *= rate / order
-                term = self._mixing @ term
+                term = _mixed(term, self._neighbours)
             self.water = total
 
     @cached_property
-    def _mixing(self) -> csr_array:
-        """1 + L / 6: every cell gives a sixth of its water to each existing neighbour and keeps the rest."""
-        at = np.stack(np.unravel_index(self.keys, self.shape), 1)
-        rows, columns = [], []
-        for axis in range(3):
-            inside = (at[:, axis] + 1 < self.shape[axis]).nonzero()[0]
-            stride = int(np.prod(self.shape[axis + 1 :]))
-            other, exists = self._find(self.keys[inside] + stride)
-            rows += [inside[exists], other[exists]]
-            columns += [other[exists], inside[exists]]
-        row, column = np.concatenate(rows).astype(np.int32), np.concatenate(columns).astype(np.int32)
-        count = len(self)
-        keep = 1.0 - np.bincount(row, minlength=count) / 6.0
-        own = np.arange(count, dtype=np.int32)
-        data = np.concatenate([np.full(len(row), 1 / 6), keep])
-        return csr_array((data, (np.concatenate([row, own]), np.concatenate([column, own]))), shape=(count, count))
+    def _columns(self) -> Int[ndarray, " k"]:
+        """First cell of every column of the lattice; keys run up each column in turn."""
+        columns = np.arange(self.shape[0] * self.shape[1] + 1) * self.shape[2]
+        return np.searchsorted(self.keys, columns).astype(np.int32)
+
+    @cached_property
+    def _neighbours(self) -> Int[ndarray, "c 6"]:
+        """The six neighbours of each cell; where one does not exist, the cell itself, which keeps that share."""
+        return _beside(self.keys, self._columns, self.shape)
 
     def _corners(self, points: Float[ndarray, "n 3"]) -> tuple[Int[ndarray, "n 8"], Float[ndarray, "n 8"]]:
         """Indices of the cells at the eight lattice points around each point, and their weights, 0 where there is no cell."""
         at = (np.asarray(points, np.float64) - self.lower) / self.wetting.cell
-        at = np.where(np.isfinite(at), at, -2.0)
-        corner = np.floor(at)
-        share = at - corner
-        cells, weights = [], []
-        for offset in np.ndindex(2, 2, 2):
-            lattice = corner + offset
-            inside = np.all((lattice >= 0) & (lattice < self.shape), axis=1)
-            at_edge = tuple(np.where(inside[:, None], lattice, 0).astype(np.int64).T)
-            key = np.asarray(np.ravel_multi_index(at_edge, self.shape))
-            cell, exists = self._find(key)
-            cells.append(cell)
-            weights.append(np.where(exists & inside, np.where(offset, share, 1 - share).prod(1), 0.0))
-        return np.stack(cells, 1), np.stack(weights, 1)
+        return _corners_of(at, self.keys, self._columns, self.shape)
 
-    def _find(self, keys: Int[ndarray, " n"]) -> tuple[Int[ndarray, " n"], ndarray]:
-        """Index of each key among the cells, and whether it is one of them."""
-        if len(self) == 0:
-            return np.zeros(len(keys), np.int64), np.zeros(len(keys), bool)
-        found = np.searchsorted(self.keys, keys).clip(max=len(self) - 1)
-        return found, self.keys[found] == keys
 
-    def _near(self, points: Iterable[Float[ndarray, "p 3"]]) -> Int[ndarray, " c"]:
-        """Sorted keys of the lattice points within `reach` cells of the points along every axis."""
-        # Points up to `reach` outside of the lattice also make cells inside. Keys are one number each, since sorting rows of
-        # three takes far longer.
-        reach, wide = self.wetting.reach, tuple(side + 2 * self.wetting.reach for side in self.shape)
-        keys = np.zeros(0, np.int64)
-        for piece in points:
-            at = np.rint((piece - self.lower) / self.wetting.cell).astype(np.int64) + reach
-            at = at[((at >= 0) & (at < wide)).all(1)]
-            keys = np.union1d(keys, np.ravel_multi_index(tuple(at.T), wide))
-        steps = np.arange(-reach, reach + 1)
-        for axis in range(3):  # grow a cube axis by axis
-            self._require_room(len(keys))
-            stride = math.prod(wide[axis + 1 :])
-            place = keys // stride % wide[axis]
-            moved = [keys[(place + step >= 0) & (place + step < wide[axis])] + step * stride for step in steps]
-            keys = np.unique(np.concatenate(moved))
-        at = np.stack(np.unravel_index(keys, wide), 1) - reach
-        at = at[((at >= 0) & (at < self.shape)).all(1)]
-        self._require_room(len(at))
-        return np.sort(np.ravel_multi_index(tuple(at.T), self.shape))
+@numba.njit(cache=True, nogil=True)
+def _grow(occupied, near, reach):
+    """Mark the cells within `reach` of occupied ones along every axis, which has as many more of them on each side.
 
-    def _require_room(self, cells: int) -> None:
-        if cells > MAX_CELLS:
-            edge = self.wetting.cell
-            raise ValueError(f"wetness needs at most {MAX_CELLS:,} cells, {edge:g} m make {cells:,}; take larger cells")
+    Returns their number.
+    """
+    nx, ny, nz = near.shape
+    along_z = np.zeros((nx + 2 * reach, ny + 2 * reach, nz), np.bool_)
+    for x in range(nx + 2 * reach):
+        for y in range(ny + 2 * reach):
+            seen = -1  # cells after the last occupied one that still are near it
+            for z in range(-2 * reach, nz):
+                if occupied[x, y, z + 2 * reach]:
+                    seen = 2 * reach
+                if z >= 0:
+                    along_z[x, y, z] = seen >= 0
+                seen -= 1
+    count = 0
+    for x in range(nx):
+        for y in range(ny):
+            for i in range(x, x + 2 * reach + 1):
+                for j in range(y, y + 2 * reach + 1):
+                    own, other = near[x, y], along_z[i, j]
+                    for z in range(nz):
+                        own[z] |= other[z]
+            for z in range(nz):
+                count += near[x, y, z]
+    return count
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _lowest(keys, columns, shape, x, y, z):
+    """First cell of a column that is not below z; it may be one of the next column."""
+    column = x * shape[1] + y
+    low, high, key = columns[column], columns[column + 1], column * shape[2] + z
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@numba.njit(cache=True, nogil=True)
+def _beside(keys, columns, shape):
+    nx, ny, nz = shape
+    found = np.empty((len(keys), 6), np.int32)
+    for c in range(len(keys)):
+        z, column = keys[c] % nz, keys[c] // nz
+        x, y = column // ny, column % ny
+        found[c, :] = c
+        if z > 0 and c > 0 and keys[c - 1] == keys[c] - 1:
+            found[c, 0] = c - 1
+        if z + 1 < nz and c + 1 < len(keys) and keys[c + 1] == keys[c] + 1:
+            found[c, 1] = c + 1
+        n = 2
+        for i, j in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
+            if i >= 0 and j >= 0 and i < nx and j < ny:
+                other = _lowest(keys, columns, shape, i, j, z)
+                if other < len(keys) and keys[other] == (i * ny + j) * nz + z:
+                    found[c, n] = other
+            n += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _mixed(water, neighbours):
+    """Every cell gives a sixth of its water to each existing neighbour and keeps the rest."""
+    mixed = np.empty_like(water)
+    for c in range(len(water)):
+        total = 0.0
+        for n in range(6):
+            total += water[neighbours[c, n]]
+        mixed[c] = total / 6
+    return mixed
+
+
+@numba.njit(cache=True, nogil=True)
+def _corners_of(at, keys, columns, shape):
+    nx, ny, nz = shape
+    cells, weights = np.zeros((len(at), 8), np.int64), np.zeros((len(at), 8))
+    for n in range(len(at)):
+        if not (at[n, 0] > -1 and at[n, 1] > -1 and at[n, 2] > -1 and at[n, 0] < nx and at[n, 1] < ny and at[n, 2] < nz):
+            continue
+        x, y, z = math.floor(at[n, 0]), math.floor(at[n, 1]), math.floor(at[n, 2])
+        share_x, share_y, share_z = at[n, 0] - x, at[n, 1] - y, at[n, 2] - z
+        for i in range(2):
+            for j in range(2):
+                if x + i < 0 or y + j < 0 or x + i >= nx or y + j >= ny:
+                    continue
+                flat = (share_x if i else 1 - share_x) * (share_y if j else 1 - share_y)
+                cell = _lowest(keys, columns, shape, x + i, y + j, max(z, 0))
+                for k in range(2):
+                    key = ((x + i) * ny + y + j) * nz + z + k
+                    if z + k >= 0 and z + k < nz and cell < len(keys) and keys[cell] == key:
+                        cells[n, 4 * i + 2 * j + k] = cell
+                        weights[n, 4 * i + 2 * j + k] = flat * (share_z if k else 1 - share_z)
+                        cell += 1
+    return cells, weights
