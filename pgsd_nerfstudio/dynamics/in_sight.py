@@ -133,39 +133,46 @@ def _in_sight(
 ):
     """`share` of the way from one frame to the next is made while the shutter is open."""
     n = births.shape[0]
-    active, collided = np.empty(n, np.int64), np.empty(n, np.int64)
-    n_active, n_collided = 0, 0
+    active, collided, rows = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    n_flying, n_active, n_collided = 0, 0, 0
     for i in range(n):
         if births[i] > frame:
             continue
         if frame < ends[i]:
-            first, last = offsets[i], offsets[i + 1] - 1
-            row = first + frame - births[i]
-            if _seen(positions, row, reaches[i], active_extents[i], 0.0, eye):
-                active[n_active] = i
-                n_active += 1
-            elif share > 0.0:
-                # The way of this or of a neighbouring frame (see ParticleHistory.displacement_at): the longest of them.
-                way = 0.0
-                for k in range(max(row - 1, first + 1), min(row + 1, last) + 1):
-                    x = positions[k, 0] - positions[k - 1, 0]
-                    y = positions[k, 1] - positions[k - 1, 1]
-                    z = positions[k, 2] - positions[k - 1, 2]
-                    way = max(way, math.sqrt(x * x + y * y + z * z))
-                if _seen(positions, row, reaches[i], active_extents[i], share * way, eye):
-                    active[n_active] = i
-                    n_active += 1
-        elif has_collided[i] and _seen(rest_positions, i, math.inf, collided_extents[i], 0.0, eye):
+            active[n_flying] = i
+            rows[n_flying] = offsets[i] + frame - births[i]
+            n_flying += 1
+        elif has_collided[i] and _seen(rest_positions[i], math.inf, collided_extents[i], 0.0, eye):
             collided[n_collided] = i
             n_collided += 1
+    # The positions of a frame lie far apart in memory. A loop that does nothing but fetch them waits for many at once.
+    places = np.empty((n_flying, 3), positions.dtype)
+    for k in range(n_flying):
+        row = rows[k]
+        places[k, 0], places[k, 1], places[k, 2] = positions[row, 0], positions[row, 1], positions[row, 2]
+    for k in range(n_flying):
+        i = active[k]
+        seen = _seen(places[k], reaches[i], active_extents[i], 0.0, eye)
+        if share > 0.0 and not seen and _seen(places[k], reaches[i], math.inf, 0.0, eye):
+            # The way of this or of a neighbouring frame (see ParticleHistory.displacement_at): the longest of them.
+            way = 0.0
+            for row in range(max(rows[k] - 1, offsets[i] + 1), min(rows[k] + 1, offsets[i + 1] - 1) + 1):
+                x = positions[row, 0] - positions[row - 1, 0]
+                y = positions[row, 1] - positions[row - 1, 1]
+                z = positions[row, 2] - positions[row - 1, 2]
+                way = max(way, math.sqrt(x * x + y * y + z * z))
+            seen = _seen(places[k], reaches[i], active_extents[i], share * way, eye)
+        if seen:
+            active[n_active] = i
+            n_active += 1
     return active[:n_active].copy(), collided[:n_collided].copy()
 
 
 @numba.njit(inline="always")
-def _seen(points, i, reach, extent, way, eye):
-    """Whether a ball around point i, of standard deviation `extent` + `way`, touches the picture within reach of the camera."""
+def _seen(point, reach, extent, way, eye):
+    """Whether a ball around a point, of standard deviation `extent` + `way`, touches the picture within reach of the camera."""
     m = eye.viewmat
-    px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    px, py, pz = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
     z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
     if z < eye.near * 0.999 or z > eye.far:
         return False

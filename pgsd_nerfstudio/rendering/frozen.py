@@ -88,9 +88,9 @@ def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple
         splats,
     )
     ids = visible_by_depth(splats)
-    visible = splats[ids]
+    visible = np.take(splats, ids, axis=0)  # several times faster than an index of rows
     if gaussians.colors.ndim == 2 and shade is None:
-        visible[:, RED : BLUE + 1] = float_array(gaussians.colors)[ids]
+        visible[:, RED : BLUE + 1] = np.take(float_array(gaussians.colors), ids, axis=0)
     else:
         seen = torch.from_numpy(ids).long()
         colors, means = gaussians.colors.detach()[seen], gaussians.means.detach()[seen]
