@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -35,7 +35,8 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
-MOST_SOFTENING = 3.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
+MOST_SOFTENING = 5.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
+FLATNESS, STEEPEST_EDGE = 0.1, 1.5  # variance of log luminance that counts as flat; change of log factor per log luminance
 _REVISION = 6  # of the computation; stored answers of another revision are not used
 
 
@@ -236,9 +237,28 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
         return None
     seen = lit(sun, metric.means, exposure.normals, surface)
     factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
-    # Shadows of the mesh are some centimetres off those of the picture; averaging over neighbours avoids bright rims.
     _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
-    return factor.log()[torch.from_numpy(around).reshape(len(factor), -1)].mean(1).exp()
+    around = torch.from_numpy(around).reshape(len(factor), -1)
+    return _along_edges(factor.log(), luminance(linear(metric.colors)).clamp_min(1e-3).log(), around).exp()
+
+
+def _along_edges(values: Float[Tensor, " n"], guide: Float[Tensor, " n"], around: Int[Tensor, "n k"]) -> Float[Tensor, " n"]:
+    """Values averaged over neighbours, with the edges of a guide (He, Sun & Tang, "Guided image filtering", 2010, eq. 5-8).
+
+    Shadows of the mesh are some centimetres off those of the picture; the edges are taken where the colours have them. What is
+    brighter than its neighbours never gets a higher value than they for it.
+
+    Args:
+        values: logarithm of a factor.
+        guide: logarithm of the luminance.
+        around: indices of the neighbours.
+    """
+    near, light = values[around], guide[around]
+    mean, middle = near.mean(1), light.mean(1)
+    joint = ((near - mean[:, None]) * (light - middle[:, None])).mean(1)
+    slope = (joint / (light.var(1, unbiased=False) + FLATNESS)).clamp(-STEEPEST_EDGE, 0.0)
+    most = values.abs().amax()
+    return (mean + slope * (guide - middle)).clamp(-most, most)
 
 
 def sun_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh) -> Sunlight | None:
