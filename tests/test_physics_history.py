@@ -157,7 +157,7 @@ def test_a_run_put_together_from_chunks_is_the_same_bit_for_bit_when_loaded(tmp_
         start=0,
         frames=frames,
         row_ids=np.tile(np.arange(count, dtype=np.int32), frames),
-        row_frames=np.arange(frames, dtype=np.int32).repeat(count),
+        row_counts=np.full(frames, count, np.int32),
         row_positions=rng.normal(size=(count * frames, 3)).astype(np.float32),
         births=np.zeros(count, np.int32),
         diameters=one,

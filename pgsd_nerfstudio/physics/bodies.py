@@ -59,7 +59,10 @@ class Bodies:
         Args:
             which: mask or indices.
         """
-        return Bodies(*(getattr(self, f.name)[which] for f in fields(self)))
+        which = np.asarray(which)
+        if which.dtype == np.bool_:
+            which = which.nonzero()[0]  # found once for all arrays
+        return Bodies(*(getattr(self, f.name).take(which, 0) for f in fields(self)))
 
     @staticmethod
     def join(parts: Sequence[Bodies]) -> Bodies:

@@ -8,8 +8,11 @@ import numpy as np
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.air.air import Air
+from pgsd_nerfstudio.physics.air.leaving import Leaving
 from pgsd_nerfstudio.physics.air.splash import splashed
 from pgsd_nerfstudio.physics.bodies import ABSORBED, DENSE, LEFT, SLID, SPLASHED, UNSEEN, Bodies, RunState
+from pgsd_nerfstudio.physics.curve import along_curve
+from pgsd_nerfstudio.physics.flock import Flock
 from pgsd_nerfstudio.physics.ground.deposits import Deposits
 from pgsd_nerfstudio.physics.ground.landing import Meeting
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
@@ -45,53 +48,62 @@ class _Simulation:
 
     def __init__(self, air: Air, deposits: Deposits, log: Log, state: RunState) -> None:
         self.air, self.deposits, self.log = air, deposits, log
-        self.flying = Bodies.join([state.flying])  # a copy, since `Air.fly` changes arrays in place
+        self.flock = Flock(state.flying)
         self.sliding, self.dense = state.sliding, state.dense
 
     def state(self) -> RunState:
-        return RunState(self.flying, self.sliding, self.dense, self.deposits.snapshot(), self.log.born)
+        return RunState(Bodies.join([self.flock.bodies]), self.sliding, self.dense, self.deposits.snapshot(), self.log.born)
 
     def begin(self) -> None:
         """Frame 0: particles that are in the air from the start enter."""
-        self.flying = self.log.enter(self.air.arriving(0), 0)
+        self._enter(self.air.arriving(0), 0)
 
     def advance(self, frame: int) -> None:
         """Advance from the frame before to `frame`."""
-        air, log = self.air, self.log
-        before = self.flying.positions.copy()
-        air.fly(self.flying, frame)
-        contacts = air.ground.meet(before, self.flying.positions, self.deposits.cover)
-        self.flying.positions[contacts.which] = contacts.points
-        free = self._leave(contacts, frame)
+        air, log, flying = self.air, self.log, self.flock.bodies
+        before = flying.positions.copy()
+        air.fly(flying, frame)
+        contacts = air.ground.meet(before, flying.positions, self.deposits.cover)
+        flying.positions[contacts.which] = contacts.points
+        in_contact = flying.select(contacts.which)
+        self._leave(contacts, frame)
+        log.see(self.flock.bodies, frame)
         took_off = self._slide(frame)
         self._move_dense(frame)
-        in_contact = self.flying.select(contacts.which)
         gliding, droplets = self._resolve_contacts(in_contact, contacts, frame)
-        entering = air.entering(frame)
-        log.see(free, frame)
-        stay = Bodies.join([free, took_off, gliding])
-        self.flying = Bodies.join([stay, log.enter(droplets, frame), log.enter(entering, frame)])
+        self.flock.add(took_off)
+        self.flock.add(gliding)
+        self._enter(droplets, frame)
+        self._enter(air.entering(frame), frame)
         self.deposits.age(air.step)
-        for bodies in (self.flying, self.sliding, self.dense):
+        for bodies in (self.sliding, self.dense):
             _check(bodies, frame)
 
-    def _leave(self, contacts: Meeting, frame: int) -> Bodies:
-        """Particles that fly on without a contact.
+    def _enter(self, bodies: Bodies, frame: int) -> None:
+        """Let new particles into the air.
+
+        They enter along a curve through the domain. Particles beside each other in memory then mostly stay beside each other in
+        the air, where they read the same nodes of the wind, cells of maps, and triangles.
+        """
+        _check(bodies, frame)
+        order = along_curve(bodies.positions, np.asarray(self.air.domain.lower), np.asarray(self.air.domain.upper))
+        self.flock.add(self.log.enter(bodies.select(order), frame))
+
+    def _leave(self, contacts: Meeting, frame: int) -> None:
+        """Take out the particles that have a contact, and those that end.
 
         A particle ends when it leaves the domain, when no camera can see it within its reach any more, and when it flies out
         ahead of the weather's front.
         """
-        air, bodies, log = self.air, self.flying, self.log
-        lower, upper = np.asarray(air.domain.lower, np.float32), np.asarray(air.domain.upper, np.float32)
-        out = ((bodies.positions < lower) | (bodies.positions > upper)).any(1)
-        contact = np.zeros(len(bodies), bool)
-        contact[contacts.which] = True
-        ahead = ~contact & ~out & ~air.arrival.passed(bodies.positions, frame * air.step)
-        unseen = ~(contact | out | ahead) & ~air.sight.needed(bodies.positions, bodies.reaches)
-        log.end(bodies.select(out & ~contact), frame, LEFT)
-        log.end(bodies.select(ahead), frame, LEFT)
-        log.end(bodies.select(unseen), frame, UNSEEN)
-        return bodies.select(~(contact | out | ahead | unseen))
+        air, bodies, log = self.air, self.flock.bodies, self.log
+        front = air.arrival.is_front and frame * air.step < air.effect.timeline.onset
+        passed = air.arrival.passed(bodies.positions, frame * air.step) if front else None
+        found = Leaving.of(bodies, contacts.which, air.domain, air.sight, passed)
+        if found.broken:
+            _check(bodies, frame)
+        for which, how in ((found.out, LEFT), (found.ahead, LEFT), (found.unseen, UNSEEN)):
+            log.end(bodies.ids[which], frame, how)
+        self.flock.keep(found.stays)
 
     def _slide(self, frame: int) -> Bodies:
         """Move sliders and land the slow ones; returns the sliders that fly again."""
@@ -118,7 +130,7 @@ class _Simulation:
                 velocities=moved.velocities.astype(np.float32),
             )
             log.see(bodies.select(~moved.left), frame)
-            log.end(bodies.select(moved.left), frame, LEFT)
+            log.end(bodies.ids[moved.left], frame, LEFT)
             self._land(bodies.select(moved.rests), frame, heaped=True)
             self.dense = bodies.select(~(moved.rests | moved.left))
         if crowded.any():
@@ -155,7 +167,7 @@ class _Simulation:
                 rng = air.draws(frame, 0x59A5)
                 droplets, share = splashed(air, response.splash, bodies, contacts.normals, rng)
             self.deposits.wet(bodies, 1 - share)
-            log.end(bodies, frame + 1, ABSORBED)
+            log.end(bodies.ids, frame + 1, ABSORBED)
             return Bodies.none(), droplets
         hold = air.ground.holds(contacts.normals, bodies.holds)
         self._land(bodies.select(hold), frame)

@@ -102,7 +102,9 @@ class RunRecord:
             start=0,
             frames=clock.frames,
             row_ids=np.concatenate([ids for ids, _, _ in self._rows]),
-            row_frames=np.concatenate([np.full(len(ids), frame, np.int32) for ids, frame, _ in self._rows]),
+            row_counts=np.bincount(
+                [frame for _, frame, _ in self._rows], [len(ids) for ids, _, _ in self._rows], clock.frames
+            ).astype(np.int32),
             row_positions=np.concatenate([positions for _, _, positions in self._rows]),
             births=np.concatenate([np.full(count, frame, np.int32) for frame, count in self._births]),
             diameters=np.full(self.born, self.diameter, np.float32),

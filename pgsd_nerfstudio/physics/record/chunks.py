@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -14,7 +15,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Clock
-from pgsd_nerfstudio.physics.record.codec import quantised
+from pgsd_nerfstudio.physics.record.codec import FINEST, exponent_for
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
@@ -27,7 +28,8 @@ class Chunk:
     frames: int
     row_ids: Int[ndarray, " m"]
     """Particle of each row; rows are ordered by frame."""
-    row_frames: Int[ndarray, " m"]
+    row_counts: Int[ndarray, " f"]
+    """Number of rows of each frame."""
     row_positions: Float[ndarray, "m 3"]
     """Metres."""
     births: Int[ndarray, " b"]
@@ -131,9 +133,6 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     ended, how = joined("ended_ids"), joined("ended_how")
     ends[ended] = joined("ended_frames")
     offsets = np.concatenate([[0], np.cumsum(ends.astype(np.int64) - births)])
-    ids = joined("row_ids")
-    positions = np.full((offsets[-1], 3), np.nan, np.float32)
-    positions[offsets[ids] + joined("row_frames") - births[ids]] = joined("row_positions")
     rests, collided = joined("rest_ids"), np.zeros(count, bool)
     collided[rests] = True
     rest = {f"rest_{name}": np.zeros((count, *shape), np.float32) for name, shape in _REST.items()}
@@ -149,7 +148,7 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         "ends": ends,
         "collided": collided,
         "offsets": offsets,
-        "positions": quantised(positions, offsets),
+        "positions": _trajectories(chunks, births, offsets),
         **rest,
         "quats": joined("quats"),
         "diameters": joined("diameters"),
@@ -163,3 +162,48 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     counts |= {"slid": int((kinds & SLID > 0).sum()), "dense": int((kinds & DENSE > 0).sum())}
     tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
     return ParticleHistory(**tensors, fps=clock.fps, frames=clock.frames, about={**about, **counts})
+
+
+def _trajectories(chunks: Sequence[Chunk], births: Int[ndarray, " p"], offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
+    """The rows of all chunks ordered by particle and frame, rounded to the lattice of `codec`; NaN where a row is missing.
+
+    Raises:
+        ValueError: a position is NaN or infinite, or a row belongs to a frame in which its particle is not active.
+    """
+    positions = np.full((int(offsets[-1]), 3), np.nan, np.float32)
+    exponent = FINEST
+    while True:  # the lattice is nearly always the finest; where a coordinate is too large for it, the rows are placed again
+        largest = 0.0
+        for chunk in chunks:
+            rows = chunk.row_positions, chunk.row_ids, chunk.row_counts.astype(np.int64)
+            found, bad = _place(positions, *rows, chunk.start, births, offsets, 2.0**-exponent, 2.0**exponent)
+            largest = max(largest, float(found))
+            if bad >= 0:
+                frame = chunk.start + int(np.searchsorted(np.cumsum(chunk.row_counts), bad, side="right"))
+                where = f"in frame {frame}: {chunk.row_positions[bad].tolist()}"
+                raise ValueError(f"the position of particle {chunk.row_ids[bad]} is not finite, or it is not active, {where}")
+        if exponent_for(largest) == exponent:
+            return positions
+        exponent = exponent_for(largest)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(positions, row_positions, row_ids, row_counts, start, births, offsets, quanta, quantum):
+    """Put rounded rows into their places; returns the largest absolute coordinate, and the first row without a place, or -1."""
+    largest, row = np.float32(0.0), 0
+    for frame in range(len(row_counts)):
+        for _ in range(row_counts[frame]):
+            particle = row_ids[row]
+            place = offsets[particle] + (start + frame - births[particle])
+            size = np.float32(0.0)
+            for axis in range(3):
+                size = max(size, abs(row_positions[row, axis]))
+            whole = row_positions[row, 0] + row_positions[row, 1] + row_positions[row, 2]  # NaN where one of them is
+            if not (size < np.inf and whole == whole and place >= offsets[particle] and place < offsets[particle + 1]):
+                return largest, row
+            largest = max(largest, size)
+            for axis in range(3):
+                # The way through a whole number, as in decoding, avoids a negative zero.
+                positions[place, axis] = np.int64(np.rint(row_positions[row, axis] * quanta)) * quantum
+            row += 1
+    return largest, -1

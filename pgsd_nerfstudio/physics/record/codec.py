@@ -104,6 +104,11 @@ def _exponent(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -
             f"positions of particle {particle} are not finite {row - int(offsets[particle])} frames after its birth: "
             f"{positions[row].tolist()}"
         )
+    return exponent_for(largest)
+
+
+def exponent_for(largest: float) -> int:
+    """Binary exponent of the quantum in metres for positions with this largest absolute coordinate in metres."""
     if largest <= math.ldexp(MOST, FINEST):
         return FINEST
     # The smallest exponent with which `largest` is at most MOST quanta. Float32 is no finer there, so `largest` is a lattice

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Integer
+from jaxtyping import Int, Integer
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.bodies import LANDED, Bodies, RunState, random_orientations
+from pgsd_nerfstudio.physics.curve import along_curve
 from pgsd_nerfstudio.physics.ground.landing import Ground
 from pgsd_nerfstudio.physics.record.chunks import Chunk
+
+SPARE = 1.1  # room for rows, relative to as many in each frame as in the present one
 
 
 class Log:
@@ -24,7 +27,8 @@ class Log:
         """
         self.start, self.frames = start, frames
         self.first = self.born = born
-        self._rows: list[tuple[ndarray, int, ndarray]] = []
+        self._ids, self._positions = np.empty(0, np.int32), np.empty((0, 3), np.float32)  # rows, with room to spare
+        self._counts = np.zeros(frames, np.int32)
         self._births: list[tuple[int, Bodies]] = []
         self._ends: list[tuple[ndarray, int, int]] = []
         self._kinds: list[Bodies] = []
@@ -43,21 +47,30 @@ class Log:
 
     def see(self, bodies: Bodies, frame: int) -> None:
         """Record the positions of particles in a frame."""
-        self._rows.append((bodies.ids, frame, bodies.positions.copy()))
+        first = int(self._counts.sum())
+        last = first + len(bodies)
+        if last > len(self._ids):
+            frames_left = self.frames - (frame - self.start)
+            room = last + int(SPARE * frames_left * len(bodies))
+            self._ids, ids = np.empty(room, np.int32), self._ids
+            self._positions, positions = np.empty((room, 3), np.float32), self._positions
+            self._ids[:first], self._positions[:first] = ids[:first], positions[:first]
+        self._ids[first:last], self._positions[first:last] = bodies.ids, bodies.positions
+        self._counts[frame - self.start] += len(bodies)
 
     def become(self, bodies: Bodies) -> None:
         """Record particles whose kinds have changed."""
         self._kinds.append(bodies)
 
-    def end(self, bodies: Bodies, frame: int, how: int) -> None:
+    def end(self, ids: Int[ndarray, " n"], frame: int, how: int) -> None:
         """Record particles that are not active from `frame` on.
 
         Args:
-            bodies: the particles.
+            ids: the particles.
             frame: exclusive end of their active frames.
             how: LANDED, ABSORBED, LEFT or UNSEEN.
         """
-        self._ends.append((bodies.ids, frame, how))
+        self._ends.append((ids, frame, how))
 
     def land(self, bodies: Bodies, covers: ndarray, frame: int) -> None:
         """Record particles that land.
@@ -67,7 +80,7 @@ class Log:
             covers: [n] thickness of the cover beneath each, m.
             frame: their last active frame.
         """
-        self.end(bodies, frame + 1, LANDED)
+        self.end(bodies.ids, frame + 1, LANDED)
         self._landed.append((bodies, covers.astype(np.float32)))
 
     def chunk(self, ground: Ground, seed: int, state: RunState) -> Chunk:
@@ -81,16 +94,19 @@ class Log:
         new = Bodies.join([Bodies.none(), *(entering for _, entering in self._births)])
         landed = Bodies.join([Bodies.none(), *(bodies for bodies, _ in self._landed)])
         covers = np.concatenate([np.zeros(0, np.float32), *(covers for _, covers in self._landed)])
+        if len(landed):
+            # Neighbours are posed one after the other, since they meet the same triangles.
+            order = along_curve(landed.positions, landed.positions.min(0), landed.positions.max(0))
+            landed, covers = landed.select(order), covers[order]
         rest = ground.rest(landed.positions, landed.spins, covers)
         changed = Bodies.join([Bodies.none(), *self._kinds])
-        row_ids = _joined([ids for ids, _, _ in self._rows], np.int32)
-        row_frames = _joined([np.full(len(ids), frame, np.int32) for ids, frame, _ in self._rows], np.int32)
+        rows = int(self._counts.sum())
         return Chunk(
             start=self.start,
             frames=self.frames,
-            row_ids=row_ids,
-            row_frames=row_frames,
-            row_positions=np.concatenate([np.zeros((0, 3), np.float32), *(at for _, _, at in self._rows)]),
+            row_ids=self._ids[:rows],
+            row_counts=self._counts,
+            row_positions=self._positions[:rows],
             births=_joined([np.full(len(entering), frame, np.int32) for frame, entering in self._births], np.int32),
             diameters=new.diameters,
             represents=new.represents,
