@@ -197,7 +197,7 @@ class Medium:
         return read[0, 0, :, 0, 0]
 
     def _mixed(self, rgb: Tensor, depth: Tensor) -> Tensor:
-        return encoded(linear(rgb) * torch.exp(-depth) - linear(self.airlight.to(rgb)) * torch.expm1(-depth))
+        return encoded(self.mixed(linear(rgb), depth))
 
     def _across(self, pixels: Float[Tensor, "*n 2"], width: int, height: int) -> Float[Tensor, "*n 2"]:
         """Positions of pixels in the fan of rays, clamped to -1..1."""

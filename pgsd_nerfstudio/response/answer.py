@@ -20,6 +20,7 @@ from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.moment import Viewpoint
+from pgsd_nerfstudio.response.airlight import thinned
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
@@ -212,12 +213,18 @@ class Shown:
             ids: indices of these Gaussians in the scene as `altered` returns it.
             view: the camera.
         """
-        along = torch.nn.functional.normalize(view.center - means, dim=1)
+        away = view.center - means
+        metres = away.norm(dim=1) * self.answer.metres_per_unit
+        along = torch.nn.functional.normalize(away, dim=1)
         towards = along @ self.answer.up.T.to(means)
-        if self.answer.sky is not None and self.medium is not None:
-            distant = view.center - (reach(-towards[:, 2]) / self.answer.metres_per_unit)[:, None] * along
-            means = torch.where((self._sky(ids) > 0.5)[:, None], distant, means)
-        return self.moving_colors(self.lit(rgb, ids, towards), means, view)
+        light = self._light(linear(rgb), ids, towards)
+        if self.medium is None:
+            return encoded(light)
+        sky = self._sky(ids) > 0.5
+        distant = view.center - (reach(-towards[:, 2]) / self.answer.metres_per_unit)[:, None] * along
+        way = self.medium.optical_depth(torch.where(sky[:, None], distant, means), *view)
+        near = thinned(way, metres, self.answer.effect)
+        return encoded(self.medium.mixed(light, torch.where(sky, way, near)[:, None]))
 
     def _sky(self, ids: Int[Tensor, " m"]) -> Float[Tensor, " m"]:
         """Share of sky of Gaussians of the scene as `altered` returns it."""
@@ -227,7 +234,8 @@ class Shown:
         return torch.where(ids < total, self.answer.sky[ids.clamp_max(total - 1)], 0.0)
 
     def moving_colors(self, rgb: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], view: Viewpoint) -> Float[Tensor, "n 3"]:
-        """Colours of particles as a view shows them through the haze; arguments as for `frozen_colors`."""
+        """Colours of particles as a view shows them through the haze; arguments as for `frozen_colors`. They are small, so all
+        the light that the air scatters is lost to them."""
         return rgb if self.medium is None else self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
 
     def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
