@@ -3,9 +3,9 @@
 Koschmieder's airlight is that before an open horizon. Before a dark wall it is less, since the light that droplets would send
 on is that of the wall; and the light of the wall that they send on is not lost. The delta-Eddington approximation (Joseph,
 Wiscombe & Weinman, "The delta-Eddington approximation for radiative flux transfer", 1976) counts the share f = g^2 of the
-scattered light as not scattered: the optical depth becomes (1 - f) tau. This holds where the surroundings fill the cone into which air
-scatters half of its light, 15 degrees about the ray for g = 0.85 (Henyey & Greenstein, 1941). Surroundings of the height H at
-the distance d fill the share H / (d tan 15), at most 1.
+scattered light as not scattered: the optical depth becomes (1 - f) tau. This holds where the surroundings fill the cone into
+which air scatters half of its light, 15 degrees about the ray for g = 0.85 (Henyey & Greenstein, 1941). Surroundings of the
+height H at the distance d fill the share H / (d tan 15), at most 1.
 
 In a path-traced courtyard in fog of a visibility of 60 m, airlight relative to the sky is 0.05, 0.04, 0.06, 0.12 and 0.16 at
 3.2, 4.1, 5.8, 8.5 and 9.9 m; this gives 0.06, 0.07, 0.10, 0.14 and 0.16, and Koschmieder's law 0.19, 0.24, 0.31, 0.42 and 0.48.
