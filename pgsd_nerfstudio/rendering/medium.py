@@ -30,6 +30,9 @@ from pgsd_nerfstudio.rendering.display import encoded, linear
 Extinction: TypeAlias = Callable[[Float[Tensor, "n 3"]], Float[Tensor, " n"]]
 """From points in scene units to the extinction per scene unit."""
 
+Lengths: TypeAlias = Callable[[Float[Tensor, " n"]], Float[Tensor, " n"]]
+"""From distances to the camera to the lengths of full air that lie before them, both in scene units."""
+
 CLOSEST = 2.0  # pixels between rays, at least; small pictures do not show more
 BEYOND = 100.0  # the air of the last slice goes on to so many times the distance of its end
 
@@ -90,7 +93,13 @@ class Froxels:
 class Medium:
     """The air of one moment; it knows nothing of weather. Several threads may use it."""
 
-    def __init__(self, airlight: Float[Tensor, "3"], extinction: Extinction | float, froxels: Froxels | None = None) -> None:
+    def __init__(
+        self,
+        airlight: Float[Tensor, "3"],
+        extinction: Extinction | float,
+        froxels: Froxels | None = None,
+        lengths: Lengths | None = None,
+    ) -> None:
         """Keep the numbers; nothing is sampled before the first camera.
 
         Args:
@@ -98,6 +107,7 @@ class Medium:
             extinction: per scene unit; a number stands for air that is the same everywhere, which needs no froxels and is
                 exact.
             froxels: resolution of the samples.
+            lengths: how much of the air before each distance counts; None: all of it.
 
         Raises:
             ValueError: a number is negative or not finite.
@@ -107,6 +117,7 @@ class Medium:
         self.airlight = airlight
         self.extinction = extinction
         self.froxels = froxels or Froxels()
+        self.lengths = lengths
         self._sampled: tuple[tuple[Tensor, Tensor, int, int], Tensor] | None = None
 
     def through(
@@ -156,7 +167,8 @@ class Medium:
             raise ValueError(f"the background must lie at a positive, finite distance, found {far} scene units")
         own = torch.zeros(3).to(viewmat) if background is None else background
         if not callable(self.extinction):
-            return self._mixed(own, torch.tensor(self.extinction * far).to(own))
+            length = self._length(torch.tensor([far]).to(own))
+            return self._mixed(own, self.extinction * length)
         depths = self._depths(viewmat, K, width, height)
         slot = float(self.froxels.slots(torch.tensor([far], dtype=torch.float64)))
         here = min(int(slot), len(depths) - 2)
@@ -187,7 +199,7 @@ class Medium:
         points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         distances = points.norm(dim=1)
         if not callable(self.extinction):
-            return self.extinction * distances
+            return self.extinction * self._length(distances)
         depths = self._depths(viewmat, K, width, height)
         # Points beside or behind the camera are not drawn; they only must not divide by zero.
         pixels = points[:, :2] / points[:, 2:].clamp_min(1e-6) * K.diagonal()[:2] + K[:2, 2]
@@ -195,6 +207,13 @@ class Medium:
         at = torch.cat([self._across(pixels, width, height), along[:, None]], dim=1)
         read = grid_sample(depths[None, None], at[None, :, None, None, :], "bilinear", "border", align_corners=True)
         return read[0, 0, :, 0, 0]
+
+    def _length(self, distances: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        return distances if self.lengths is None else self.lengths(distances)
+
+    def mixed(self, light: Tensor, depth: Tensor) -> Tensor:
+        """Linear light behind air of an optical depth, mixed with the airlight; the shapes broadcast."""
+        return light * torch.exp(-depth) - linear(self.airlight.to(light)) * torch.expm1(-depth)
 
     def _mixed(self, rgb: Tensor, depth: Tensor) -> Tensor:
         return encoded(self.mixed(linear(rgb), depth))
@@ -220,7 +239,7 @@ class Medium:
         assert callable(self.extinction)
         found = self.extinction(points.view(-1, 3)).view(points.shape[:3])
         slices = torch.cat([torch.zeros_like(found[:1]), found, found[-1:]])
-        slices[1:] *= edges.diff()[:, None, None]
+        slices[1:] *= self._length(edges).diff()[:, None, None]
         depths = slices.cumsum(0)
         self._sampled = (view[0].clone(), view[1].clone(), width, height), depths
         return depths
