@@ -47,6 +47,8 @@ def test_matter_rests_on_the_floor_in_large_cells_too(monkeypatch):
         **{name: np.zeros(n, np.float32) for name in ("speeds", "diameters", "sways", "hertz", "phases", "holds", "spins")},
         represents=np.ones(n, np.float32),
         reaches=np.full(n, 1e9, np.float32),
+        since=np.zeros(n, np.int32),
+        until=np.full(n, 2**31 - 1, np.int32),
         kinds=np.zeros(n, np.uint8),
     )
     heap.add(bodies, np.full(n, 1e-4))

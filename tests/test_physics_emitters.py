@@ -11,7 +11,7 @@ import torch
 
 from pgsd_nerfstudio.effects import SNOWFALL, Wind
 from pgsd_nerfstudio.effects.snowfall import fall_speed, mass, melted_diameter, number_density
-from pgsd_nerfstudio.physics.air.emitters import Sizes, fill, outside
+from pgsd_nerfstudio.physics.air.emitters import CANDIDATES, Sizes, fill, outside
 from pgsd_nerfstudio.physics.air.reach import FADE, kept, reaches, shown
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.clock import Domain
@@ -93,8 +93,9 @@ def test_cameras_see_all_flakes_nearby_and_fewer_far_away(most):
     sight = camera()
     sizes = Sizes.of(SNOWFALL, DOMAIN, most, sight, 800.0)
     found = fill(sizes, DOMAIN, sight, np.random.default_rng(0))
-    assert len(found.positions) < 1.03 * most
     distances = sight.distances(found.positions)
+    seen = (sight._look_up(sight.seen_distances, found.positions) <= found.reaches).sum()
+    assert seen < 1.1 * most and len(found.positions) < 1.1 * CANDIDATES * most
     assert (found.reaches >= distances).all()
     volume, edges = sight.cell.prod(), (0.4, 1.2, 2.5, 4.0, 7.0)
     for low, high in itertools.pairwise(edges):

@@ -17,6 +17,7 @@ GRAVITY = 9.81  # m/s^2, in all motion here; the fits in laws.fall_speeds were m
 LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; a particle that has not ended is active
 ENDS = {"landed": LANDED, "absorbed": ABSORBED, "left": LEFT, "unseen": UNSEEN}
 ANY_DISTANCE = np.float32(1e9)  # m; the reach of a particle that is shown however far it is
+NO_END = np.iinfo(np.int32).max  # frame
 SPLASHED, SLID, DENSE = 1, 2, 4  # bits of `kinds`: the particle is a splash droplet, has slid, has been dense matter
 
 
@@ -47,6 +48,10 @@ class Bodies:
     """Real particles that each particle represents."""
     reaches: Float[ndarray, " n"]
     """Metres up to which each particle is told apart by a camera; it is simulated only where it may come so near to one."""
+    since: Int[ndarray, " n"]
+    """Frame in which each particle begins to matter, int32; until then it waits (`foresight`)."""
+    until: Int[ndarray, " n"]
+    """Last frame in which it matters while it flies, int32."""
     kinds: UInt8[ndarray, " n"]
     """Bits SPLASHED, SLID and DENSE."""
 
@@ -81,7 +86,7 @@ class Bodies:
     def none() -> Bodies:
         """No particles."""
         widths = {"positions": (0, 3), "velocities": (0, 3)}
-        types = {"ids": np.int32, "kinds": np.uint8}
+        types = {"ids": np.int32, "since": np.int32, "until": np.int32, "kinds": np.uint8}
         return Bodies(*(np.zeros(widths.get(f.name, 0), types.get(f.name, np.float32)) for f in fields(Bodies)))
 
 
@@ -92,6 +97,8 @@ class RunState:
     flying: Bodies
     sliding: Bodies
     dense: Bodies
+    coming: Bodies
+    """Particles that wait until they matter; they have no ids yet."""
     deposits: Mapping[str, ndarray]
     """State of cover, wetness and dense matter; see `deposits.Deposits`."""
     born: int
@@ -100,7 +107,7 @@ class RunState:
     @staticmethod
     def empty() -> RunState:
         """The state before the first frame."""
-        return RunState(Bodies.none(), Bodies.none(), Bodies.none(), {}, 0)
+        return RunState(Bodies.none(), Bodies.none(), Bodies.none(), Bodies.none(), {}, 0)
 
     @property
     def moving(self) -> int:
@@ -109,7 +116,7 @@ class RunState:
 
     def arrays(self) -> dict[str, ndarray]:
         """All arrays by name; `of` reads them back."""
-        groups = {"flying": self.flying, "sliding": self.sliding, "dense": self.dense}
+        groups = {group: getattr(self, group) for group in _GROUPS}
         named = {f"{group}.{f.name}": getattr(bodies, f.name) for group, bodies in groups.items() for f in fields(Bodies)}
         return named | with_prefix("deposits.", self.deposits)
 
@@ -121,10 +128,11 @@ class RunState:
             arrays: what the method `arrays` returned.
             born: number of particles so far.
         """
-        flying, sliding, dense = (
-            Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in ("flying", "sliding", "dense")
-        )
-        return RunState(flying, sliding, dense, without_prefix("deposits.", arrays), born)
+        groups = (Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in _GROUPS)
+        return RunState(*groups, without_prefix("deposits.", arrays), born)
+
+
+_GROUPS = ("flying", "sliding", "dense", "coming")
 
 
 T = TypeVar("T")

@@ -8,12 +8,14 @@ import numpy as np
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.air.air import Air
+from pgsd_nerfstudio.physics.air.emitters import Newcomers
 from pgsd_nerfstudio.physics.air.leaving import Leaving
 from pgsd_nerfstudio.physics.air.splash import splashed
-from pgsd_nerfstudio.physics.bodies import ABSORBED, DENSE, LEFT, SLID, SPLASHED, UNSEEN, Bodies, RunState
+from pgsd_nerfstudio.physics.bodies import ABSORBED, ANY_DISTANCE, DENSE, LEFT, SLID, SPLASHED, UNSEEN, Bodies, RunState
 from pgsd_nerfstudio.physics.curve import along_curve
 from pgsd_nerfstudio.physics.flock import Flock
 from pgsd_nerfstudio.physics.ground.deposits import Deposits
+from pgsd_nerfstudio.physics.ground.drips import DIAMETER, DRIPPED
 from pgsd_nerfstudio.physics.ground.landing import Meeting
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.chunks import Chunk
@@ -49,14 +51,15 @@ class _Simulation:
     def __init__(self, air: Air, deposits: Deposits, log: Log, state: RunState) -> None:
         self.air, self.deposits, self.log = air, deposits, log
         self.flock = Flock(state.flying)
-        self.sliding, self.dense = state.sliding, state.dense
+        self.sliding, self.dense, self.coming = state.sliding, state.dense, state.coming
 
     def state(self) -> RunState:
-        return RunState(Bodies.join([self.flock.bodies]), self.sliding, self.dense, self.deposits.snapshot(), self.log.born)
+        flying = Bodies.join([self.flock.bodies])
+        return RunState(flying, self.sliding, self.dense, self.coming, self.deposits.snapshot(), self.log.born)
 
     def begin(self) -> None:
         """Frame 0: particles that are in the air from the start enter."""
-        self._enter(self.air.arriving(0), 0)
+        self._enter(self._due(self.air.arriving(0), 0), 0)
 
     def advance(self, frame: int) -> None:
         """Advance from the frame before to `frame`."""
@@ -74,7 +77,8 @@ class _Simulation:
         self.flock.add(took_off)
         self.flock.add(gliding)
         self._enter(droplets, frame)
-        self._enter(air.entering(frame), frame)
+        self._enter(self._due(air.entering(frame), frame), frame)
+        self._enter(self._dripping(frame), frame)
         self.deposits.age(air.step)
         for bodies in (self.sliding, self.dense):
             _check(bodies, frame)
@@ -89,6 +93,25 @@ class _Simulation:
         order = along_curve(bodies.positions, np.asarray(self.air.domain.lower), np.asarray(self.air.domain.upper))
         self.flock.add(self.log.enter(bodies.select(order), frame))
 
+    def _due(self, new: Bodies, frame: int) -> Bodies:
+        """New particles that matter in a frame, and those that have waited for it; the others wait."""
+        late = self.coming.since == frame
+        begins = self.air.unhidden(self.coming.select(late), frame)
+        now = new.since <= frame
+        self.coming = Bodies.join([self.coming.select(~late), new.select(~now)])
+        return Bodies.join([new.select(now), begins])
+
+    def _dripping(self, frame: int) -> Bodies:
+        """Drops that let go of edges within the frame."""
+        air = self.air
+        places, stands_for = self.deposits.dripping((frame - 1) * air.step, frame * air.step)
+        if len(places) == 0:
+            return Bodies.none()
+        size, reach = np.full(len(places), DIAMETER), np.full(len(places), ANY_DISTANCE)
+        new = air.newborn(Newcomers(places, size, reach), np.zeros_like(places), air.draws(frame, 0xD819))
+        new.represents[:] = stands_for
+        return new.marked(DRIPPED)
+
     def _leave(self, contacts: Meeting, frame: int) -> None:
         """Take out the particles that have a contact, and those that end.
 
@@ -98,7 +121,7 @@ class _Simulation:
         air, bodies, log = self.air, self.flock.bodies, self.log
         front = air.arrival.is_front and frame * air.step < air.effect.timeline.onset
         passed = air.arrival.passed(bodies.positions, frame * air.step) if front else None
-        found = Leaving.of(bodies, contacts.which, air.domain, air.sight, passed)
+        found = Leaving.of(bodies, contacts.which, air.domain, air.sight, passed, bodies.until < frame)
         if found.broken:
             _check(bodies, frame)
         for which, how in ((found.out, LEFT), (found.ahead, LEFT), (found.unseen, UNSEEN)):
@@ -158,7 +181,10 @@ class _Simulation:
                 ),
                 Bodies.none(),
             )
-        # Fewer come so far as were born with it: each stands for those that were dropped on the way too.
+        # What no camera would show here leaves nothing: those that are left stand for it too.
+        needed = air.sight.needed(bodies.positions, bodies.reaches)
+        log.end(bodies.ids[~needed], frame + 1, UNSEEN)
+        bodies, contacts = bodies.select(needed), Meeting(*(values[needed] for values in contacts))
         stand_for = np.where(bodies.kinds & SPLASHED, bodies.represents, air.represents(bodies.positions, bodies.diameters))
         bodies = replace(bodies, represents=stand_for)
         if response.landing in ("wets", "vanishes"):

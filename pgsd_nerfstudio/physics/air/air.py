@@ -18,9 +18,10 @@ from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.air.airborne import Flutter, advance, air_velocity
 from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.air.emitters import Newcomers, Sizes, fill, outside
+from pgsd_nerfstudio.physics.air.foresight import foresee
 from pgsd_nerfstudio.physics.air.sight import WIDEST_SWAY, Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
-from pgsd_nerfstudio.physics.bodies import Bodies
+from pgsd_nerfstudio.physics.bodies import NO_END, Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.landing import Ground
 from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
@@ -110,6 +111,8 @@ class Air:
             spins=draw[4].astype(np.float32),
             represents=self.represents(positions, diameters),
             reaches=reaches.astype(np.float32),
+            since=np.zeros(count, np.int32),
+            until=np.full(count, NO_END, np.int32),
             kinds=np.zeros(count, np.uint8),
         )
 
@@ -146,6 +149,8 @@ class Air:
     def entering(self, frame: int) -> Bodies:
         """New particles of a frame, without ids: through the top and the sides, and where the weather arrives.
 
+        Those that do not matter yet have a frame `since` that is later.
+
         Args:
             frame: the frame in which they enter.
         """
@@ -164,7 +169,22 @@ class Air:
         # What comes through the top comes from the sky; through a side it may come from the lee of a wall or from below a roof.
         beside = found.positions[enters, 2] <= self.domain.upper[2]
         beside[beside] = self.shadowed(new.positions[beside], new.speeds[beside], time)
-        return Bodies.join([new.select(~beside), self.arriving(frame)])
+        return Bodies.join([self._that_matter(new.select(~beside), frame), self.arriving(frame)])
+
+    def _that_matter(self, new: Bodies, frame: int) -> Bodies:
+        """Of new particles those that will be seen, from when on they will; all of them where distance does not matter."""
+        if self.sizes.sharpness is None:
+            return new
+        return foresee(new, frame, step=self.step, wind=self.wind, domain=self.domain, sight=self.sight)
+
+    def unhidden(self, late: Bodies, frame: int) -> Bodies:
+        """Of particles that waited those that nothing held up on their way.
+
+        Args:
+            late: particles that begin to matter in `frame`.
+            frame: the frame.
+        """
+        return late.select(~self.shadowed(late.positions, late.speeds, frame * self.step))
 
     def _margins(self, time: float) -> Float[ndarray, "2 3"]:
         """Metres around the domain from which particles may enter within a step: its lower and its upper sides."""
@@ -190,7 +210,7 @@ class Air:
         found = found.select(now)
         speeds = fall_speed(found.diameters, self.effect.material)
         new = self.newborn(found, self.settled(found.positions, speeds, time), self.draws(frame, ARRIVING))
-        return new.select(~self.shadowed(found.positions, speeds, time))
+        return self._that_matter(new.select(~self.shadowed(found.positions, speeds, time)), frame)
 
     def _passed_by_front(self, frame: int) -> Bodies:
         """Particles ahead of the front in the frame before and behind it in `frame`."""
@@ -209,7 +229,7 @@ class Air:
         inside = ((new.positions >= self.domain.lower) & (new.positions <= self.domain.upper)).all(1)
         inside &= self.sight.needed(new.positions, new.reaches) & self.arrival.passed(new.positions, time)
         inside[inside] = ~self.shadowed(new.positions[inside], new.speeds[inside], time)
-        return new.select(inside)
+        return self._that_matter(new.select(inside), frame)
 
     def _before_front(self, before: float) -> Bool[ndarray, "x y z"] | None:
         """Cells of the region of sight from which a front may be met within a step; None where there are no cells."""

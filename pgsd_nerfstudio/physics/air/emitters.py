@@ -23,10 +23,13 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.air.reach import kept, reaches
-from pgsd_nerfstudio.physics.air.sight import Sight
+from pgsd_nerfstudio.physics.air.sight import CLOSEST, Sight
 from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.populations import cumulative, integral, number_density
+
+
+CANDIDATES = 5  # particles that may come into view, to one that is in view: at most so many are led along their way
 
 
 class Newcomers(NamedTuple):
@@ -70,7 +73,7 @@ class Sizes:
         Args:
             effect: its emission and material.
             domain: the simulated air.
-            max_particles: about the most particles in it at once.
+            max_particles: about the most particles in it at once; where cameras are given, the most that they see.
             sight: distances of its cells from cameras.
             sharpness: distance up to which cameras tell all particles apart, relative to their diameter; it is lowered where
                 there would be too many particles. None: particles are thinned alike everywhere.
@@ -86,16 +89,19 @@ class Sizes:
 
             factor = _largest(evenly, float(1.0 / weight.min()), max_particles)
             return Sizes(diameter, density, np.minimum(1.0, factor * weight), None)
-        levels, cells = np.unique(sight.needed_distances, return_counts=True)
-        volumes = (cells * sight.cell.prod())[np.isfinite(levels), None]
-        levels = levels[np.isfinite(levels), None]
+        for distances, most in ((sight.seen_distances, max_particles), (sight.needed_distances, CANDIDATES * max_particles)):
+            levels = distances[np.isfinite(distances)].clip(CLOSEST)
+            if levels.size:
+                cells, edges = np.histogram(levels, np.geomspace(0.9 * CLOSEST, max(float(levels.max()), 1.0) * 1.01, 64))
+                volumes, middles = (cells * sight.cell.prod())[:, None], np.sqrt(edges[1:] * edges[:-1])[:, None]
 
-        def by_distance(sharpness: float) -> float:
-            # Particles of 256 sizes are enough to count them.
-            some = diameter[::4]
-            return integral(density[::4] * (volumes * kept(sharpness * some, levels)).sum(0), some)
+                def by_distance(sharpness: float, volumes: ndarray = volumes, middles: ndarray = middles) -> float:
+                    # Particles of 256 sizes are enough to count them.
+                    some = diameter[::4]
+                    return integral(density[::4] * (volumes * kept(sharpness * some, middles)).sum(0), some)
 
-        return Sizes(diameter, density, np.ones_like(density), _largest(by_distance, sharpness, max_particles))
+                sharpness = _largest(by_distance, sharpness, most)
+        return Sizes(diameter, density, np.ones_like(density), sharpness)
 
     @property
     def real_in_air(self) -> float:

@@ -20,7 +20,7 @@ from numpy import ndarray
 from rich.console import Console
 from rich.progress import track
 
-from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, Bodies
+from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, NO_END, Bodies
 from pgsd_nerfstudio.physics.clock import Clock, Domain
 from pgsd_nerfstudio.physics.ground.landing import Ground
 from pgsd_nerfstudio.physics.paper.config import PaperConfig
@@ -147,6 +147,8 @@ def _in_air(solver: PaperSolver, ids: Int[ndarray, " n"], box: Box, config: Pape
         "diameters": np.full(len(ids), config.diameter, np.float32),
         "represents": np.ones(len(ids), np.float32),
         "reaches": np.full(len(ids), ANY_DISTANCE),
+        "since": np.zeros(len(ids), np.int32),
+        "until": np.full(len(ids), NO_END, np.int32),
         "kinds": np.zeros(len(ids), np.uint8),
     }
     return Bodies(*(known.get(f.name, zeros) for f in fields(Bodies)))
