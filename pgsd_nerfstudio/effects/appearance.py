@@ -124,13 +124,11 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     """
     generator = torch.Generator().manual_seed(seed)
     looks, diameters = effect.appearance, particles.diameters.cpu().float()
-    active = _look(looks.active, _flake_scales(looks.active, diameters), generator)
+    wider = math.sqrt(looks.legibility)
+    active = _look(looks.active, wider * _flake_scales(looks.active, diameters), generator)
     if looks.active.opacity is None:
         shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one
         active = ParticleLook(opacity_of_extinction(shadow, active.scales), active.scales, active.rgb)
-    if looks.active.fades_below > 0:
-        thin = (diameters / looks.active.fades_below).clamp_max(1.0) ** 2
-        active = ParticleLook(active.opacity * thin, active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
     # A patch is not wider than the surface around it, so that it does not hang over the edge of a table, and never so wide that
     # it would look like a ball of wool: the answer of the scene draws the cover.

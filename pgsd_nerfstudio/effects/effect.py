@@ -64,9 +64,6 @@ class StateLook:
     obey Beer-Lambert."""
     opacity_spread: float = 0.10
     """Spread of the opacity from particle to particle."""
-    fades_below: float = 0.0
-    """Diameter in metres below which the opacity falls with the particle's area; 0: it never falls. A rasterizer draws nothing
-    thinner than a pixel, so without this spray would be as bright as drops."""
     rgb: tuple[float, float, float] = (0.95, 0.97, 1.0)
     """Colour, sRGB."""
     tone_spread: float = 0.04

@@ -22,7 +22,7 @@ from pgsd_nerfstudio.effects.effect import full_name
 from pgsd_nerfstudio.effects.matter import CONTRASTS, Visibility
 
 if TYPE_CHECKING:
-    from pgsd_nerfstudio.effects.effect import Effect, Wind
+    from pgsd_nerfstudio.effects.effect import Appearance, Effect, Wind
     from pgsd_nerfstudio.effects.haze import Haze
     from pgsd_nerfstudio.effects.language_model import Understanding
     from pgsd_nerfstudio.effects.request import Rgb
@@ -99,6 +99,9 @@ class EffectOptions:
     exposure: float | None = None
     """Shutter time in seconds: active particles are smeared by speed times this (a film camera: 0.02).
     By default the effect's own, which for snow is 0, no motion blur."""
+    legibility: float | None = None
+    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature: right for data sets and for comparisons,
+    but rain is then next to invisible. By default the effect's own, chosen by looking and said when it is not 1."""
 
     def __post_init__(self) -> None:
         # Stored options, and the commands that are made of them, have one name for one weather.
@@ -136,8 +139,9 @@ class EffectOptions:
             emission=replace(effect.emission, visibility=self.visibility),
             haze=self._haze(effect.haze),
             ambience=effect.ambience if self.ambience else None,
+            appearance=self._appearance(effect.appearance),
         )
-        return effect, said
+        return effect, [*said, *legible(effect)]
 
     def check(self) -> None:
         """Refuse what can be refused without asking anyone.
@@ -227,6 +231,9 @@ class EffectOptions:
             surface = replace(surface, landing="vanishes")  # drops still splash
         return surface
 
+    def _appearance(self, appearance: Appearance) -> Appearance:
+        return appearance if self.legibility is None else replace(appearance, legibility=self.legibility)
+
     def _haze(self, haze: Haze | None) -> Haze | None:
         rgb = None if self.haze_color is None else colour_of("haze-color", self.haze_color)
         return None if haze is None else replace(haze, amount=haze.amount * self.haze, rgb=rgb or haze.rgb)
@@ -243,6 +250,16 @@ class EffectOptions:
         if self.accumulation_speedup is not None and not gathers:
             lapse = f"--accumulation-speedup {self.accumulation_speedup:g}"
             yield f"{lapse} changes nothing: {effect.name} leaves no layer and no puddles here"
+
+
+def legible(effect: Effect) -> list[str]:
+    """What is to be said about how much more of a view particles take than in nature."""
+    factor = effect.appearance.legibility
+    if factor == 1:
+        return []
+    return [
+        f"what flies is drawn with {factor:g} times its area, {factor**0.5:.2g} times as wide (--legibility 1: as in nature)"
+    ]
 
 
 @lru_cache(maxsize=64)

@@ -22,16 +22,17 @@ RAINFALL = register(
         wind=Wind(speed=2.0, turbulence=0.25, flutter=0.0),
         surface=SurfaceResponse(landing="wets", splash=Splash(), accumulates=False, darkens=0.012),
         appearance=Appearance(
+            # pi / 4 D^2 = 2 pi (0.36 D)^2 0.97: a drop covers what a disc of its diameter does.
             active=StateLook(
-                scale_per_diameter=(2.2, 2.2, 2.2),
+                scale_per_diameter=(0.36, 0.36, 0.36),
                 scale_spread=0.0,
                 opacity=0.97,
-                opacity_spread=0.2,
-                fades_below=1.2e-3,
+                opacity_spread=0.0,
                 rgb=(0.92, 0.94, 0.97),
                 tone_spread=0.1,
             ),
-            exposure=1 / 90,
+            legibility=8.0,
+            exposure=1 / 50,
         ),
         haze=Haze(rgb=(0.62, 0.66, 0.70)),
         ambience=Ambience(clouds=0.95, stops=-0.3, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),

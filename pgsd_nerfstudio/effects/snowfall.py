@@ -31,7 +31,7 @@ SNOWFALL = register(
         surface=SurfaceResponse(hides=0.008),
         dense=Dense(matter="snow"),
         appearance=Appearance(
-            active=StateLook(scale_per_diameter=(0.34, 0.28, 0.16), scale_spread=0.2, opacity=0.8, opacity_spread=0.18),
+            active=StateLook(scale_per_diameter=(0.34, 0.28, 0.16), scale_spread=0.0, opacity=0.63, opacity_spread=0.25),
             collided=StateLook(
                 scale_spread=0.35,
                 opacity=0.75,

@@ -12,11 +12,12 @@ that; storms differ by a factor of three and more (Rasmussen et al., "The estima
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
@@ -24,8 +25,9 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws import populations
-from pgsd_nerfstudio.rendering.medium import Froxels, Medium
+from pgsd_nerfstudio.rendering.medium import Froxels, Lengths, Medium
 from pgsd_nerfstudio.response.patches import Patches
+from pgsd_nerfstudio.response.shown_share import ShownShare
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.storage import content_key
 
@@ -46,11 +48,25 @@ def full_extinction(effect: Effect) -> float:
         return 0.0
     if not emission.precipitates:
         return effect.haze.amount * populations.extinction(emission)
-    flakes = emission.kind == "snowflakes"
+    diameters, areas = areas_in_air(effect)
+    return effect.haze.amount * 2 * populations.integral(areas, diameters)
+
+
+def areas_in_air(effect: Effect) -> tuple[Float[ndarray, " a"], Float[ndarray, " a"]]:
+    """Diameters in metres of flakes or drops of all natural sizes, and the density of their areas, 1/m^2 per metre of diameter.
+
+    Args:
+        effect: snow or rain.
+    """
+    flakes = effect.emission.kind == "snowflakes"
     diameters = np.geomspace(*(SNOWFLAKES if flakes else RAINDROPS), 1024)
-    density = populations.number_density(diameters, emission, effect.material)
-    taken = 2 * 1e-4 * 0.2285 * (1e2 * diameters) ** 1.88 if flakes else populations.cross_section(diameters)
-    return effect.haze.amount * populations.integral(density * taken, diameters)
+    density = populations.number_density(diameters, effect.emission, effect.material)
+    return diameters, density * (flake_area(diameters) if flakes else 0.25 * math.pi * diameters**2)
+
+
+def flake_area(diameters: Float[ndarray, " a"]) -> Float[ndarray, " a"]:
+    """Area in m^2 of aggregates with diameters in metres (Mitchell 1996, table 1)."""
+    return 1e-4 * 0.2285 * (1e2 * diameters) ** 1.88
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +125,8 @@ class HazeField:
     frame: Frame
     identity: str
     """Hash of all that the haze was made from."""
+    shown: ShownShare | None = None
+    """What of the haze is left beside the particles that are shown; None: all of it."""
 
     @staticmethod
     def of(effect: Effect, frame: Frame, domain: Domain, *, seed: int = 0) -> HazeField:
@@ -143,6 +161,18 @@ class HazeField:
             identity=content_key(*made_from, frame.metres_per_unit, frame.rotation, frame.origin),
         )
 
+    def beside(self, effect: Effect, sharpness: float | None) -> HazeField:
+        """The haze beside the particles of a simulation, which take their part of the light themselves.
+
+        Args:
+            effect: the weather.
+            sharpness: as `ParticleHistory.about` has it; None: thinning did not depend on distance, and nothing is left out.
+        """
+        if sharpness is None or not effect.emission.precipitates:
+            return replace(self, shown=None)
+        shown = ShownShare.of(effect, sharpness, areas_in_air(effect))
+        return replace(self, shown=shown, identity=content_key(self.identity, sharpness))
+
     def at(self, seconds: float) -> Medium | None:
         """The haze at a second as a medium in scene units; None if the air is clear."""
         strength = self._strength(seconds)
@@ -150,12 +180,12 @@ class HazeField:
             return None
         airlight, per_unit = torch.tensor(self.airlight), strength * self.frame.metres_per_unit
         if self._is_even(seconds):
-            return Medium(airlight, per_unit)
+            return Medium(airlight, per_unit, None, self._lengths)
 
         def extinction(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
             return per_unit * self.density(self.frame.to_metric(points), seconds)
 
-        return Medium(airlight, extinction, self._froxels())
+        return Medium(airlight, extinction, self._froxels(), self._lengths)
 
     def key(self, seconds: float) -> bytes:
         """Name of the haze at a second; equal names mean equal haze, and clear air has an empty name."""
@@ -192,6 +222,13 @@ class HazeField:
         """Whether the haze is the same everywhere within sight."""
         gone = self.front is None or self.front.left(self.domain, seconds) > self._reach
         return gone and self.patches is None and math.isinf(self.scale_height) and self.parcels == 0.0
+
+    @property
+    def _lengths(self) -> Lengths | None:
+        if self.shown is None:
+            return None
+        shown, unit = self.shown, self.frame.metres_per_unit
+        return lambda distances: shown.before(distances * unit) / unit
 
     @property
     def _deviation(self) -> float:

@@ -108,7 +108,7 @@ def make_weather(
     surface = surface_of(prepared.scene, prepared.rasterizer, progress=progress)
     history = motion_of(prepared, surface, effect, options, progress=progress).to(prepared.device)
     answer = answer_to(prepared, surface, effect, options, edited_images=edited_images).struck_by(history)
-    return Weather(prepared, effect, options, history, answer)
+    return Weather(prepared, effect, options, history, answer.beside(history.about.get("sharpness")))
 
 
 def motion_of(
