@@ -63,10 +63,9 @@ def _puddles(effect=DEEP) -> Puddles:
 
 def _mirror(puddles: Puddles, towards: torch.Tensor):
     count = len(puddles.points)
-    ids, up = torch.arange(count), torch.tensor([0.0, 0, 1]).repeat(count, 1)
     now = puddles.at(8.0)
     assert now.share.min() == 1
-    return now.mirror(ids, towards.repeat(count, 1), up, torch.zeros(count, dtype=torch.bool), torch.ones(count), 0.0)
+    return now.mirror(torch.arange(count), towards.repeat(count, 1), torch.ones(count), 0.0)
 
 
 @pytest.mark.parametrize("degrees", [20.0, 45.0, 70.0, 85.0])

@@ -20,9 +20,10 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 MOST = 400  # crowns in one view
-JETS = 7  # of a crown
+JETS = 9  # of a crown
 LIVES = 0.06  # s
 HEIGHT = 3.0  # of the highest jets in diameters of the drop
+WIDEST = 1.6  # radius of a crown in diameters, at most
 WIDE = 0.38  # standard deviation of a jet in diameters
 OPACITY = 0.85
 SMALLEST = 1.2e-3  # m; drops below make no crown (Splash.joule_per_droplet)
@@ -46,7 +47,7 @@ def crowns_of(impacts: Impacts, seconds: float, camera: Cameras, white: Float[Te
     young = young.select(best[size[best] > FAINT])
     count, diameter = len(young), math.sqrt(legibility) * young.diameters[:, None]
     age = (seconds - young.times)[:, None] / LIVES
-    radius = diameter * np.minimum((2 / 3) ** 0.25 * np.sqrt(2 * young.speeds[:, None] * LIVES * age / diameter), 3.0)
+    radius = diameter * np.minimum((2 / 3) ** 0.25 * np.sqrt(2 * young.speeds[:, None] * LIVES * age / diameter), WIDEST)
     # Jets of a crown differ; the places of drops draw how.
     draw = np.modf(1e4 * young.places[:, :1] * (1 + np.arange(JETS)))[0] ** 2
     height = diameter * HEIGHT * (0.4 + 0.6 * draw) * 4 * age * (1 - age)

@@ -30,7 +30,8 @@ NEIGHBOURS = 6  # Gaussians that colour a vertex
 NEAR = 0.03  # m, standard deviation of their weights
 OPAQUE = 0.3  # opacity from which a Gaussian colours the mesh
 UNDERSIDE = 0.35  # light of the underside of a surface relative to its upper side
-LIFT = 0.003  # m; rays start this far above the water
+LIFT = 0.04  # m; rays start this far above the water, since the mesh of a capture is rough
+AGAIN = 0.25  # m behind a hit from where a ray goes on that has met the rough ground itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,11 @@ class MirroredScene:
         if len(self.surface.triangles) and len(points):
             start = points + LIFT * torch.tensor([0.0, 0.0, 1.0])
             found = self.surface.raycasting.cast_rays(queries(start, directions))
+            distance = torch.from_numpy(found["t_hit"].numpy())
+            ground = (distance * directions[:, 2] < LIFT) & (distance < math.inf)
+            # What is less than twice the lift above the water is its own ground.
+            onward = torch.where(ground, distance + AGAIN, 0.0)[:, None] * directions
+            found = self.surface.raycasting.cast_rays(queries(start + onward, directions)) if bool(ground.any()) else found
             met = np.isfinite(found["t_hit"].numpy())
             which = torch.from_numpy(found["primitive_ids"].numpy()[met].astype(np.int64))
             u, v = torch.from_numpy(found["primitive_uvs"].numpy()[met]).unbind(1)

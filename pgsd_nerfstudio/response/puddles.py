@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -40,9 +40,10 @@ WATER = 1000.0  # kg/m^3
 FULL = 0.0006  # m of water under which nothing of the ground stands out
 GREEN = 0.4  # likeness to leaves (light.leafy) of ground that water does not cover
 SUNK = 0.03  # m; Gaussians this near to the ground are part of it
-SMOOTH_FILM = 0.6  # light that a film on wet level ground mirrors, relative to standing water
+SMOOTH_FILM = 0.45  # light that a film on wet level ground mirrors, relative to standing water
 STEEP, LEVEL = 0.75, 0.95  # upward part of a normal up to which no film mirrors, and from which it does in full
 FILLED = 0.5  # weight of the upward direction in the normal of a film
+ROUGH = 0.08  # standard deviation of a film's normal along each axis, before it is normalised
 LEAST_MIRRORED = 0.004  # share of mirrored light below which no ray is cast
 SHORT_WAVES = 500.0  # 1/m; wave number by which the slopes of rings are averaged over the size of a Gaussian
 LOWEST = 0.01  # sine of the least height above the horizon from which water mirrors light
@@ -66,6 +67,10 @@ class Puddles:
     """Their sRGB without weather."""
     sizes: Float[Tensor, " n"]
     """Middle standard deviation of each Gaussian, metres."""
+    film: Float[Tensor, " n"]
+    """Light that a film of water on each Gaussian mirrors, relative to standing water."""
+    facing: Float[Tensor, "n 3"]
+    """Unit normals of such films."""
     basin: Int[Tensor, " n"]
     """Hollow in whose ground each Gaussian lies, -1 for none."""
     floor: Float[Tensor, " n"]
@@ -104,6 +109,10 @@ class Puddles:
         # Blades of grass stand out of water that stands between them.
         part &= ~exposure.loose.numpy() & (leafy(linear(metric.colors)).numpy() < GREEN)
         bottom = np.flatnonzero(part & (basin >= 0) & (metric.opacities.numpy() > 0.3))
+        level = ((exposure.normals[:, 2] - STEEP) / (LEVEL - STEEP)).clamp(0, 1) * ~exposure.loose
+        # A film is smoother than the ground below it, whose normals in a capture are rough by themselves.
+        rough = ROUGH * torch.randn(len(metric), 3, generator=torch.Generator().manual_seed(0))
+        facing = exposure.normals + FILLED * torch.tensor([0.0, 0.0, 1.0]) + rough
         return Puddles(
             effect=effect,
             frame=frame,
@@ -112,6 +121,8 @@ class Puddles:
             points=metric.means,
             rgb=metric.colors,
             sizes=metric.scales.sort(dim=1).values[:, 1],
+            film=SMOOTH_FILM * level * (1 - leafy(linear(metric.colors))),
+            facing=torch.nn.functional.normalize(facing, dim=1),
             basin=torch.from_numpy(np.where(part, basin, -1)),
             floor=torch.from_numpy(floor).float(),
             bottom=KDTree(at[bottom, :2] if len(bottom) else np.zeros((1, 2))),
@@ -129,7 +140,7 @@ class Puddles:
         number = np.full(count, -1)
         number[kept] = np.arange(len(kept))
         left = number[self.bottom_ids] >= 0 if len(self.bottom_ids) else np.zeros(0, bool)
-        tensors = {name: change(getattr(self, name)) for name in ("points", "rgb", "sizes", "basin", "floor")}
+        tensors = {name: change(getattr(self, name)) for name in ("points", "rgb", "sizes", "film", "facing", "basin", "floor")}
         bottom = KDTree(np.asarray(self.bottom.data)[left]) if left.any() else self.bottom
         return replace(self, **tensors, bottom=bottom, bottom_ids=number[self.bottom_ids[left]])
 
@@ -182,40 +193,29 @@ class PuddlesNow:
     """Share of each Gaussian that is under standing water, 0..1."""
 
     def mirror(
-        self,
-        ids: Int[Tensor, " m"],
-        towards: Float[Tensor, "m 3"],
-        normals: Float[Tensor, "m 3"],
-        loose: Bool[Tensor, " m"],
-        wet: Float[Tensor, " m"],
-        weather: float,
+        self, ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"], wet: Float[Tensor, " m"], weather: float
     ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, " m"]]:
         """Linear light that wet Gaussians mirror, and the share of light that water does not let through from below.
 
         Args:
             ids: numbers of the Gaussians.
             towards: metric unit vectors to the camera.
-            normals: of the Gaussians, metric and unit.
-            loose: whether each is away from the surface, such as a leaf.
             wet: share of each that is wet, 0..1.
             weather: share of the full weather, 0..1.
         """
         puddles = self.puddles
         under = self.share[ids].to(towards) * wet
         pooled = (under > 0).nonzero()[:, 0]
-        up = torch.tensor([0.0, 0.0, 1.0]).to(towards)
-        # A film is smoother than the ground below it, and the normals of captured Gaussians and meshes are rough by themselves.
-        facing = torch.nn.functional.normalize(normals.to(towards) + FILLED * up, dim=1)
-        facing[pooled] = up
+        facing = puddles.facing[ids].to(towards)
+        facing[pooled] = torch.tensor([0.0, 0.0, 1.0]).to(towards)
         if puddles.ripples is not None and puddles.rippling and len(pooled):
             which = ids[pooled]
             slopes = puddles.ripples.slopes(puddles.points[which, :2].double().numpy(force=True), self.seconds)
             # Waves shorter than a Gaussian tilt its halves against each other.
             own = torch.exp(-((SHORT_WAVES * puddles.sizes[which]) ** 2) / 2).numpy(force=True)
             facing[pooled] = tilted(slopes * own[:, None]).to(towards)
-        film = ((normals[:, 2].to(towards) - STEEP) / (LEVEL - STEEP)).clamp(0, 1) * ~loose
         cosine = (facing * towards).sum(1)
-        share = torch.maximum(SMOOTH_FILM * wet * film, under) * puddles.mirrored(cosine)
+        share = torch.maximum(wet * puddles.film[ids].to(towards), under) * puddles.mirrored(cosine)
         light = torch.zeros_like(towards)
         bright = (share > LEAST_MIRRORED).nonzero()[:, 0]
         if len(bright):

@@ -17,11 +17,11 @@ from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
 from pgsd_nerfstudio.physics.laws.water_waves import Ring, crater_depth
 from pgsd_nerfstudio.response.impacts import Impacts
 
-SPREADS = (0.0018, 0.0030, 0.0048)  # m; craters of the tables
+SPREADS = (0.0025, 0.0035, 0.0050)  # m; craters of the tables
 CRATER = 1.3  # spread of a crater relative to the diameter of its drop
 WAVES = 0.05  # share of an impact's energy that goes into waves; a drop leaves most of it to the splash
 DEPTH = 0.006  # m, of the water of all rings
-SECONDS, RADIUS, DT, DR = 0.7, 0.3, 0.0015, 0.0015  # length, reach and steps of the tables
+SECONDS, RADIUS, DT, DR = 0.7, 0.3, 0.001, 0.0005  # length, reach and steps of the tables
 NEAR_GROUND = 0.03  # m; a drop that ends so near to the ground of a hollow has fallen into it
 STEEPEST = 0.5  # slope that linear waves do not exceed here
 BIN = 0.12  # m; edge of the squares by which points near a ring are found
@@ -126,7 +126,7 @@ def _add(
             continue
         late = when - row
         table = tables[numbers[i]]
-        reach = min(RADIUS, 0.05 + 0.45 * ages[i])  # capillary waves of these lengths are not faster
+        reach = min(RADIUS, 0.05 + 0.6 * ages[i])  # waves of these lengths are not faster
         x, y = places[i]
         left, right = math.floor((x - reach - lower[0]) / BIN), math.floor((x + reach - lower[0]) / BIN)
         near, away = math.floor((y - reach - lower[1]) / BIN), math.floor((y + reach - lower[1]) / BIN)

@@ -113,7 +113,7 @@ def transform(k: Float[ndarray, " k"], spread: float) -> Float[ndarray, " k"]:
 
 def _wave_numbers(spread: float, radius: float, seconds: float, depth: float) -> tuple[ndarray, ndarray]:
     """Wave numbers and weights of the integral over k, fine enough for the fastest turn of its integrand."""
-    top = 7.0 / spread  # beyond, exp(-k^2 s^2 / 2) is below 1e-10
+    top = 5.5 / spread  # beyond, exp(-k^2 s^2 / 2) is below 3e-7
     turns = (top * radius + float(frequency(np.array([top]), depth)[0]) * seconds) / (2 * math.pi)
-    nodes, weights = np.polynomial.legendre.leggauss(max(64, math.ceil(4 * turns) + 40))
+    nodes, weights = np.polynomial.legendre.leggauss(max(64, math.ceil(3.3 * turns) + 40))
     return top * (nodes + 1) / 2, top * weights / 2
