@@ -13,6 +13,7 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.effect import EFFECTS, effect
 from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.rows import motion_costs as rows_motion_costs
 from pgsd_nerfstudio.laboratory.rows import weather_ground as rows_weather_ground
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
@@ -49,6 +50,11 @@ def verify(quick: bool) -> list[Record]:
         _sun(scene),
         *rows_weather_ground.rows(quick),
     ]
+
+
+def bench(quick: bool) -> list[Record]:
+    """Costs of weather; `quick` takes one second of few particles."""
+    return list(rows_motion_costs.costs(quick))
 
 
 def _fog(scene: Scene) -> Iterator[Record]:
