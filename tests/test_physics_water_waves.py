@@ -47,9 +47,9 @@ def test_a_ring_is_the_integral_of_cauchy_and_poisson():
             return float(-(spread**4) * k**2 / 2 * np.exp(-((k * spread) ** 2) / 2) * j0(k * r) * turning * k)
 
         expected = [quad(integrand, 0, 8 / spread, args=(r,), limit=800, epsabs=1e-10)[0] for r in radii]
-        assert elevation(radii, seconds, spread, depth) == pytest.approx(expected, abs=2e-6)
+        assert elevation(radii, seconds, spread, depth) == pytest.approx(expected, abs=1e-5)
     first = -(1 - radii**2 / (2 * spread**2)) * np.exp(-(radii**2) / (2 * spread**2))
-    assert elevation(radii, 0.0, spread, depth) == pytest.approx(first, abs=2e-6)
+    assert elevation(radii, 0.0, spread, depth) == pytest.approx(first, abs=1e-5)
 
 
 def test_the_table_of_slopes_is_the_slope_of_the_elevation():
