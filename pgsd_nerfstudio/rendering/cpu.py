@@ -10,17 +10,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pgsd_nerfstudio.rendering.binning import Binned
+from pgsd_nerfstudio.rendering.binning import Binned, keep_entries
+from pgsd_nerfstudio.rendering.blending import blend_frozen
 from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
-from pgsd_nerfstudio.rendering.moment import Moments, Viewpoint, backgrounds, moment_per_frame, with_added
+from pgsd_nerfstudio.rendering.moment import Gaps, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
-from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
+from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.walk import blend_at_once, blend_backward, blend_merged
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
+
+LEAST_LIGHT = np.float32(1 / 255)  # share of the light in a pixel below which nothing behind the scene is seen
 
 
 class CpuRasterizer:
@@ -75,7 +78,7 @@ class CpuRasterizer:
         if not (torch.isfinite(cameras.viewmats).all() and torch.isfinite(cameras.Ks).all()):
             raise ValueError("the cameras' viewmats and Ks must be finite, found NaN or infinite values")
         at = moment_per_frame(moments, len(cameras))
-        frames = []
+        frames, gaps = [], []
         sets = with_added(dynamic_per_frame(dynamic, len(cameras)), at, cameras)
         for k, (moving, moment) in enumerate(zip(sets, at, strict=True)):
             # The backward pass walks over the frozen list once more, which a view that is blended alone makes shorter.
@@ -87,15 +90,19 @@ class CpuRasterizer:
             if moving is None:
                 assert frozen.image is not None
                 frames.append(torch.from_numpy(frozen.image))
+                light = frames[-1][0]
             else:
                 colors = view_colors(moving.colors, moving.means, cameras.viewmats[k])
                 if moment is not None:
                     colors = moment.moving_colors(colors, moving.means, Viewpoint.of(cameras, k, moving.means))
                 tensors = {**moving.tensors, "colors": colors}
                 drawn = _Drawn(moving.antialiased, moving.whole)
-                frames.append(_RenderMerged.apply(view, frozen, self.config, drawn, *tensors.values()))
+                asked = moment is not None
+                image, light = _RenderMerged.apply(view, frozen, self.config, drawn, asked, *tensors.values())
+                frames.append(image)
+            gaps.append(Gaps.of(light, frames[-1][4], 1.0 - frames[-1][0]))
         clip = torch.stack(frames)
-        behind = backgrounds(background, cameras, at, clip)
+        behind = backgrounds(background, cameras, at, clip, gaps)
         return composite(clip[:, 1:4].permute(0, 2, 3, 1), clip[:, 4], 1.0 - clip[:, 0], behind)
 
 
@@ -122,10 +129,13 @@ class _Walk(NamedTuple):
 
 
 class _RenderMerged(torch.autograd.Function):
-    """One frame [5, h, w] as in blending.py, with gradients for the tensors of its dynamic Gaussians."""
+    """One frame [5, h, w] as in blending.py, with gradients for the tensors of its dynamic Gaussians; and the share of light
+    [h, w] that the frozen scene lets through if that is asked, without gradients."""
 
     @staticmethod
-    def forward(ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, drawn: _Drawn, *tensors: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, view: View, frozen: FrozenView, config: RasterConfig, drawn: _Drawn, asked: bool, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
         dynamic, ids = splat(Gaussians(*tensors, **drawn._asdict()), view)
         width, height = view.lens.width, view.lens.height
         limits = np.float32(config.max_alpha), np.float32(config.min_transmittance)
@@ -133,19 +143,40 @@ class _RenderMerged(torch.autograd.Function):
             assert isinstance(frozen.part, Binned)
             image = np.empty((5, height, width), np.float32)
             blend_at_once(frozen.part, dynamic, width, height, *limits, image)
+            light = _light_of_frozen(image, dynamic, limits) if asked else image[0]
         else:
             image = frozen.image.copy()
             blend_merged(frozen.part, dynamic, width, height, *limits, image)
+            light = frozen.image[0]
         ctx.save_for_backward(*tensors)
         ctx.walk = _Walk(view, frozen.part, dynamic, drawn, ids, limits, image)
-        return torch.from_numpy(image)
+        through = torch.from_numpy(light)
+        ctx.mark_non_differentiable(through)
+        return torch.from_numpy(image), through
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, to_image: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, to_image: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
         typed = (gradient.to(tensor.dtype) for gradient, tensor in zip(gradients, ctx.saved_tensors, strict=True))
-        return None, None, None, None, *typed
+        return None, None, None, None, None, *typed
+
+
+def _light_of_frozen(image: np.ndarray, dynamic: Binned, limits: tuple[np.float32, np.float32]) -> np.ndarray:
+    """Share of light [h, w] that the frozen splats of a merged image let through.
+
+    It is the light of the image over that which the dynamic splats alone let through. These are blended once more only in tiles
+    where some light is left.
+    """
+    height, width = image.shape[1:]
+    down, across = -(-height // TILE), -(-width // TILE)
+    padded = np.zeros((down * TILE, across * TILE), np.float32)
+    padded[:height, :width] = image[0]
+    open_tiles = (padded.reshape(down, TILE, across, TILE) > LEAST_LIGHT).any((1, 3)).ravel()
+    some = keep_entries(dynamic, np.repeat(open_tiles, np.diff(dynamic.offsets)))
+    alone = np.empty_like(image)
+    blend_frozen(some, width, height, *limits, alone, np.zeros(len(some.entries), bool))
+    return np.minimum(image[0] / np.maximum(alone[0], np.float32(1e-4)), np.float32(1))
 
 
 def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:

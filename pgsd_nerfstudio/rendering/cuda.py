@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
 from pgsd_nerfstudio.rendering.isects import Isects, merge
-from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
+from pgsd_nerfstudio.rendering.moment import Gaps, Moment, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.motion_blur import footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
@@ -102,8 +102,10 @@ class GsplatRasterizer:
         """As `Rasterizer.render`."""
         at = moment_per_frame(moments, len(cameras))
         moving = with_added(dynamic_per_frame(dynamic, len(cameras)), at, cameras)
-        clip = torch.stack([self._frame(cameras, k, moving[k], at[k]) for k in range(len(cameras))])
-        behind = backgrounds(background, cameras, at, clip)
+        frames = [self._frame(cameras, k, moving[k], at[k]) for k in range(len(cameras))]
+        clip = torch.stack([image for image, _ in frames])
+        gaps = [Gaps.of(light, image[..., 3], image[..., 4]) for image, light in frames]
+        behind = backgrounds(background, cameras, at, clip, gaps)
         return composite(clip[..., :3], clip[..., 3], clip[..., 4], behind)
 
     @staticmethod
@@ -111,8 +113,11 @@ class GsplatRasterizer:
         if frozen.device.type != "cuda":
             raise ValueError(f"GsplatRasterizer expects Gaussians on CUDA, found them on {frozen.device}; call .to('cuda')")
 
-    def _frame(self, cameras: Cameras, k: int, moving: Gaussians | None, moment: Moment | None) -> Float[Tensor, "h w 5"]:
-        """Sums along the rays of frame k: red, green, blue, weighted depth, accumulation."""
+    def _frame(
+        self, cameras: Cameras, k: int, moving: Gaussians | None, moment: Moment | None
+    ) -> tuple[Float[Tensor, "h w 5"], Float[Tensor, "h w"]]:
+        """Sums along the rays of frame k: red, green, blue, weighted depth, accumulation; and the share of light that the
+        frozen scene lets through, if there is a moment to ask for it."""
         view = Viewpoint.of(cameras, k, self.frozen.means)
         # The key is made of the caller's tensors, which are mostly on the CPU, so nothing waits for the device.
         key = b"" if moment is None else moment.key
@@ -120,14 +125,19 @@ class GsplatRasterizer:
             cameras.viewmats[k], cameras.Ks[k], view.width, view.height, lambda: self._prepare(view, moment), key
         )
         if moving is None:
-            return _blend(scene, view)
+            image = _blend(scene, view)
+            return image, 1.0 - image[..., 4]
 
         def arriving(rgb: Tensor, means: Tensor, ids: Tensor) -> Tensor:
             return rgb if moment is None else moment.moving_colors(rgb, means, view)
 
         movers = self._sort(moving.to(self.frozen.device, torch.float32), view, arriving)
         splats = Splats(*(torch.cat(pair) for pair in zip(scene.splats, movers.splats, strict=True)))
-        return _blend(Sorted(splats, merge(scene.isects, movers.isects, len(scene.splats.centers))), view)
+        image = _blend(Sorted(splats, merge(scene.isects, movers.isects, len(scene.splats.centers))), view)
+        if moment is None:
+            return image, 1.0 - image[..., 4]
+        with torch.no_grad():
+            return image, 1.0 - _blend(scene, view)[..., 4]
 
     @torch.no_grad()
     def _prepare(self, view: Viewpoint, moment: Moment | None) -> Sorted:

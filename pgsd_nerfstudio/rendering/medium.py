@@ -2,9 +2,9 @@
 
 Along a ray, light of colour c from distance d arrives as c T + A (1 - T), T = exp(-optical depth), A the airlight (Koschmieder
 1924; Beer-Lambert), all in linear light. For splats the colour of each Gaussian is changed for the way from its centre to the
-camera, and the Gaussians are blended afterwards. Every rasterizer can show it and none needs to know of it. Splats blend display
-values, as they were trained; where Gaussians of one pixel differ by a factor of two in linear light, what their blend shows is
-up to 3 % darker than the blend of their light.
+camera, and the Gaussians are blended afterwards. Every rasterizer can show it and none needs to know of it. Splats blend
+display values, as they were trained; where Gaussians of one pixel differ by a factor of two in linear light, what their blend
+shows is up to 3 % darker than the blend of their light.
 
 A medium that differs from place to place is sampled once for each camera in froxels (Wronski, "Volumetric fog", SIGGRAPH
 2014): along a fan of rays, in slices that grow with distance. The optical depth of a Gaussian is interpolated between the rays,

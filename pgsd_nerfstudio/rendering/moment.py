@@ -42,6 +42,20 @@ class Viewpoint(NamedTuple):
         return torch.linalg.inv(self.viewmat.double())[:3, 3].to(self.viewmat)
 
 
+class Gaps(NamedTuple):
+    """What the frozen scene leaves open in a picture."""
+
+    light: Float[Tensor, "h w"]
+    """Share of the light from behind that the frozen scene lets through."""
+    depth: Float[Tensor, "h w"]
+    """Expected depth along the camera's z axis in scene units of what is there; 0 where nothing is."""
+
+    @staticmethod
+    def of(light: Float[Tensor, "h w"], weighted: Float[Tensor, "h w"], accumulation: Float[Tensor, "h w"]) -> Gaps:
+        """The gaps of a picture, from the sum of its weights times depths and the sum of its weights."""
+        return Gaps(light.detach(), (weighted / accumulation.clamp_min(1e-10)).detach())
+
+
 @runtime_checkable
 class Moment(Protocol):
     """What a rasterizer needs to know of a moment; lengths are in scene units."""
@@ -87,12 +101,13 @@ class Moment(Protocol):
         """
         ...
 
-    def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
+    def background(self, own: Float[Tensor, "3"], view: Viewpoint, gaps: Gaps) -> Tensor:
         """The background as a camera sees it, [3] or [h, w, 3].
 
         Args:
             own: the background without weather.
             view: the camera.
+            gaps: of the frozen scene, through which the background is seen.
         """
         ...
 
@@ -138,7 +153,11 @@ def with_added(
 
 
 def backgrounds(
-    background: Float[Tensor, "3"] | None, cameras: Cameras, moments: Sequence[Moment | None], like: Tensor
+    background: Float[Tensor, "3"] | None,
+    cameras: Cameras,
+    moments: Sequence[Moment | None],
+    like: Tensor,
+    gaps: Sequence[Gaps],
 ) -> Tensor | None:
     """The background of each frame.
 
@@ -147,6 +166,7 @@ def backgrounds(
         cameras: one for each frame.
         moments: one for each frame.
         like: tensor whose device and dtype the result has.
+        gaps: of the frozen scene in each frame.
 
     Returns:
         `background` itself if there are no moments, otherwise [t, 1 or h, 1 or w, 3].
@@ -155,7 +175,8 @@ def backgrounds(
         return background
     own = torch.zeros(3).to(like) if background is None else background.to(like)
     seen = [
-        own if moment is None else moment.background(own, Viewpoint.of(cameras, k, like)) for k, moment in enumerate(moments)
+        own if moment is None else moment.background(own, Viewpoint.of(cameras, k, like), gaps[k])
+        for k, moment in enumerate(moments)
     ]
     if all(one.ndim == 1 for one in seen):
         return torch.stack(seen)[:, None, None, :]

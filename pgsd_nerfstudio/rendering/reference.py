@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from pgsd_nerfstudio.rendering.ewa import perspective_jacobians
-from pgsd_nerfstudio.rendering.moment import Moment, Moments, Viewpoint, backgrounds, moment_per_frame
+from pgsd_nerfstudio.rendering.moment import Gaps, Moment, Moments, Viewpoint, backgrounds, moment_per_frame
 from pgsd_nerfstudio.rendering.motion_blur import determinants, footprint_opacities, stretched_covariances
 from pgsd_nerfstudio.rendering.rasterizer import TILE, RasterConfig, Rendering, composite
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -141,7 +141,12 @@ def render_reference(
     sets = [one.to(dtype) for one in ([gaussians] if isinstance(gaussians, Gaussians) else gaussians)]
     at = moment_per_frame(moments, len(cameras))
     clip = torch.stack([_render_frame(cameras, k, sets, config, at[k]) for k in range(len(cameras))])
-    behind = backgrounds(background, cameras, at, clip)
+    frozen = clip
+    if len(sets) > 1 and any(moment is not None for moment in at):
+        with torch.no_grad():
+            frozen = torch.stack([_render_frame(cameras, k, sets[:1], config, at[k]) for k in range(len(cameras))])
+    gaps = [Gaps.of(1.0 - image[..., 4], image[..., 3], image[..., 4]) for image in frozen]
+    behind = backgrounds(background, cameras, at, clip, gaps)
     return composite(clip[..., :3], clip[..., 3], clip[..., 4], behind)
 
 

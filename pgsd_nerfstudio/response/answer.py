@@ -19,8 +19,9 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.rendering.display import encoded, linear
-from pgsd_nerfstudio.rendering.moment import Viewpoint
+from pgsd_nerfstudio.rendering.moment import Gaps, Viewpoint
 from pgsd_nerfstudio.response.airlight import thinned
+from pgsd_nerfstudio.response.backdrop import behind_gaps
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.response.haze_field import HazeField
     from pgsd_nerfstudio.response.puddles import Puddles, PuddlesNow
 
-FAR = 3000.0  # m; distance of the sky for the haze
 OPAQUE_UNDER = 1.5  # a full cover adds the opacity of this many more Gaussians in the same place
 WIDER_UNDER = 0.25  # relative increase of the scales under a full cover, which closes the gaps between blades and stones
 
@@ -238,20 +238,18 @@ class Shown:
         the light that the air scatters is lost to them."""
         return rgb if self.medium is None else self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
 
-    def background(self, own: Float[Tensor, "3"], view: Viewpoint) -> Tensor:
-        """The background behind the haze.
+    def background(self, own: Float[Tensor, "3"], view: Viewpoint, gaps: Gaps) -> Tensor:
+        """The background behind the haze, [3] if nothing of the weather changes it, else [h, w, 3].
 
         Args:
             own: sRGB of the background without weather.
             view: the camera.
-
-        Returns:
-            One colour, or a picture [h, w, 3] if the haze is not the same everywhere.
+            gaps: of the frozen scene, through which the background is seen.
         """
-        if self.medium is None:
+        answer = self.answer
+        if self.medium is None and (answer.effect.ambience is None or self.share == 0):
             return own
-        far = FAR / self.answer.metres_per_unit
-        return self.medium.behind(own, view.viewmat, view.K, view.width, view.height, far)
+        return behind_gaps(own, view, gaps, self.medium, answer.effect, self.share, answer.up, answer.metres_per_unit)
 
     def lit(self, rgb: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
         """Colours [m, 3] of frozen Gaussians with light, water and cover of the moment, without haze.

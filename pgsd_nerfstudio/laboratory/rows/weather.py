@@ -20,7 +20,7 @@ from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.rendering.medium import Medium
-from pgsd_nerfstudio.rendering.moment import Viewpoint
+from pgsd_nerfstudio.rendering.moment import Gaps, Viewpoint
 from pgsd_nerfstudio.rendering.reference import render_reference
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.exposure import Exposure
@@ -141,7 +141,7 @@ class _Air:
     def moving_colors(self, rgb: Tensor, means: Tensor, view: Viewpoint) -> Tensor:
         return self.medium.through(rgb, means, view.viewmat, view.K, view.width, view.height)
 
-    def background(self, own: Tensor, view: Viewpoint) -> Tensor:
+    def background(self, own: Tensor, view: Viewpoint, gaps: Gaps) -> Tensor:
         self.seen_behind = self.medium.behind(own, view.viewmat, view.K, view.width, view.height, 1e4)
         return self.seen_behind
 
