@@ -1,5 +1,6 @@
 """Physics of weather particles: it simulates their trajectories, the motion prior."""
 
+from pgsd_nerfstudio import vectors as vectors  # before the first kernel
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.clock import Clock, Domain, domain_of
 from pgsd_nerfstudio.physics.metric import MAX_PARTICLES, simulate_metric

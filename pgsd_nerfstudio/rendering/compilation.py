@@ -21,6 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from pgsd_nerfstudio import vectors as vectors  # before the first kernel
+
 # Reordering and fused operations, but comparisons with NaN and infinity keep their meaning (no "nnan", no "ninf").
 _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
