@@ -58,7 +58,9 @@ class Preview(WeatherCommand):
             path = slow_path(scene, frames=self._shown, fps=self.simulation.fps, start=self._first, views=self.views)
         make_folder(self.output)
         with refusing(OSError, ValueError):  # a full disk while caching, edited pictures that do not fit
-            weather = make_weather(prepare_scene(scene), effect, self.simulation, edited_images=self.answer.edited_images)
+            seen = None if self.simulation.everything else path
+            images = self.answer.edited_images
+            weather = make_weather(prepare_scene(scene), effect, self.simulation, path=seen, edited_images=images)
         cameras = path.resized(*self._size(path))
         if not _meets_particles(weather, cameras):
             say(

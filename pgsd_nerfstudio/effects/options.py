@@ -100,8 +100,8 @@ class EffectOptions:
     """Shutter time in seconds: active particles are smeared by speed times this (a film camera: 0.02).
     By default the effect's own, which for snow is 0, no motion blur."""
     legibility: float | None = None
-    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature: right for data sets and for comparisons,
-    but rain is then next to invisible. By default the effect's own, chosen by looking and said when it is not 1."""
+    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature: right for data sets and for
+    comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking and said if it is not 1."""
 
     def __post_init__(self) -> None:
         # Stored options, and the commands that are made of them, have one name for one weather.

@@ -40,7 +40,7 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-MAX_PARTICLES = 20_000  # flying at once; a CPU renders and refines that many in reasonable time
+MAX_PARTICLES = 20_000  # seen at once; a CPU refines that many in reasonable time
 CHUNK = 25  # frames; an interruption loses at most that many
 LEAST_GUSTS = 0.35  # smallest gustiness that the region of sight allows for
 WIDEST_PICTURE = 640  # pixels; in wider pictures even more could be told apart, and hardly anyone would see it
@@ -70,7 +70,7 @@ def simulate_metric(
         clock: frame rate and number of frames.
         domain: the simulated air, in metres.
         seed: of all random numbers.
-        max_particles: most particles in the air at once; each then represents several real particles. None: MAX_PARTICLES.
+        max_particles: most particles that the cameras see at once, or that are in the air without cameras. None: MAX_PARTICLES.
         cameras: in metres. Particles that cannot come into the view of any of them are left out. None: all are simulated.
         progress: show a bar.
         resume: folder that keeps chunks until the run is complete. None keeps nothing.

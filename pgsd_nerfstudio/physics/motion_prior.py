@@ -16,6 +16,7 @@ from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import cache_dir, content_key
 
 if TYPE_CHECKING:
+    from pgsd_nerfstudio.scene.cameras import Cameras
     from pgsd_nerfstudio.scene.scene import Scene
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
@@ -33,6 +34,7 @@ def motion_prior(
     max_particles: int | None = None,
     profile: Profile = "metric",
     everything: bool = False,
+    path: Cameras | None = None,
     cache: bool = True,
     progress: bool = True,
 ) -> ParticleHistory:
@@ -46,10 +48,11 @@ def motion_prior(
         effect: the weather.
         clock: frame rate and number of frames.
         seed: of all random numbers.
-        max_particles: most particles in the air at once. None: MAX_PARTICLES.
+        max_particles: most particles that the cameras see at once. None: MAX_PARTICLES.
         profile: `metric`, or `paper` for MPM throughout with the published numbers. The paper's simulation lasts 500 frames, of
             which the clock takes the first.
-        everything: also simulate particles that none of the scene's cameras can see.
+        everything: also simulate particles that no camera can see.
+        path: cameras in scene units that alone will see the weather; None: all cameras of the scene.
         cache: read and write the cache.
         progress: show a bar, then print one line about the result.
 
@@ -60,7 +63,7 @@ def motion_prior(
     if profile == "metric":
         domain = down_to_ground(domain, surface)
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
-    cameras = None if everything else scene.frame.cameras_to_metric(scene.cameras)
+    cameras = None if everything else scene.frame.cameras_to_metric(scene.cameras if path is None else path)
     parts = (effect.emission, effect.material, effect.wind, effect.timeline, effect.surface, effect.dense)
     parts = (*parts, effect.appearance.legibility)
     what = (surface.vertices, surface.triangles, effect.name, *parts, clock, domain, seed, max_particles, cameras)

@@ -82,7 +82,7 @@ def prepare_weather(prepared: PreparedScene, options: RunOptions) -> Weather:
         RunError: the scene cannot hold this weather, or the disk is full.
     """
     try:
-        effect, simulation = options.chosen_effect(), options.simulation
+        effect, simulation = options.chosen_effect(), options.simulation.for_training
         weather = make_weather(prepared, effect, simulation, edited_images=options.answer.edited_images)
         return _without_simulation(weather) if options.motion.motion == "deformation" else weather
     except (OSError, ValueError) as error:

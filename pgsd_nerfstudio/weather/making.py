@@ -14,6 +14,7 @@ from pgsd_nerfstudio.physics.motion_prior import Profile, motion_prior
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.prepare import answer_of, edits_of
+from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
 from pgsd_nerfstudio.weather.options import SimulationOptions
@@ -52,7 +53,8 @@ def simulate(
         seconds: length of the weather in seconds.
         fps: frames per second of the simulation.
         seed: another seed gives another weather of the same kind.
-        max_particles: most active particles at once; by default 20,000, with CUDA 100,000.
+        max_particles: most particles that cameras see at once, a bound for machines: where it is reached, fewer are told apart
+            far away. By default 200,000, with CUDA 1,000,000.
         physics: `metric` is right in SI units, `paper` is the publication's solver and numbers.
         everything: simulate also the air that no camera of the scene sees.
         collisions: whether particles meet the scene's surface.
@@ -89,6 +91,7 @@ def make_weather(
     effect: Effect,
     options: SimulationOptions,
     *,
+    path: Cameras | None = None,
     edited_images: Path | None = None,
     progress: bool = True,
 ) -> Weather:
@@ -98,6 +101,7 @@ def make_weather(
         prepared: the scene on a device.
         effect: the weather.
         options: how its motion is simulated.
+        path: cameras in scene units that alone will see it; None: all cameras of the scene.
         edited_images: as for `simulate`.
         progress: as for `simulate`.
 
@@ -106,7 +110,7 @@ def make_weather(
         OSError: the cache cannot be written.
     """
     surface = surface_of(prepared.scene, prepared.rasterizer, progress=progress)
-    history = motion_of(prepared, surface, effect, options, progress=progress).to(prepared.device)
+    history = motion_of(prepared, surface, effect, options, path=path, progress=progress).to(prepared.device)
     answer = answer_to(prepared, surface, effect, options, edited_images=edited_images).struck_by(history)
     return Weather(prepared, effect, options, history, answer.beside(history.about.get("sharpness")))
 
@@ -117,6 +121,7 @@ def motion_of(
     effect: Effect,
     options: SimulationOptions,
     *,
+    path: Cameras | None = None,
     progress: bool = True,
 ) -> ParticleHistory:
     """The motion prior of a weather, from the cache where it was simulated before.
@@ -126,6 +131,7 @@ def motion_of(
         surface: of that scene, in metres.
         effect: the weather.
         options: how its motion is simulated.
+        path: as for `make_weather`.
         progress: show a bar and one line about the result on stderr.
 
     Returns:
@@ -143,6 +149,7 @@ def motion_of(
         max_particles=options.particles,
         profile=options.physics,
         everything=options.everything,
+        path=path,
         progress=progress,
     )
 

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 FLAT = tyro.conf.arg(name="")
 """Marks a group of options whose flags carry no prefix."""
 
-PARTICLES_CPU, PARTICLES_CUDA = 20_000, 100_000
-"""Most active particles at once, where nothing is asked for: what a roll-out and its pictures take in reasonable time."""
+PARTICLES_CPU, PARTICLES_CUDA = 200_000, 1_000_000
+"""Most particles that cameras see at once, where nothing is asked for: what pictures take in reasonable time."""
+TRAINED_CPU, TRAINED_CUDA = 20_000, 100_000
+"""The same for training, which rolls all of them out again and again."""
 MOST_SECONDS = 3600.0
 MOST_FRAMES = 200_000
 MOST_PARTICLES = 10_000_000
@@ -93,8 +95,9 @@ class SimulationOptions:
     fps: float = 25.0
     """Frames per second of the simulation and of what is shown of it; 25 as in the paper's videos."""
     max_particles: int | None = None
-    """Most active particles at once, each standing for several real ones: bounds time and memory. Droplets of splashes come on
-    top; --physics paper has its own number. By default 20,000, with CUDA 100,000."""
+    """Bound for time and memory: most particles that cameras see at once. All that a picture tells apart are there, as far as
+    this allows; what is too far away is haze. Droplets of splashes come on top; --physics paper has its own number.
+    By default 200,000 (training: 20,000), with CUDA 1,000,000 (training: 100,000)."""
     physics: Literal["metric", "paper"] = "metric"
     """metric is right in SI units; paper is the publication's solver and numbers (MPM throughout in a unit cube, no air),
     to compare with."""
@@ -153,8 +156,13 @@ class SimulationOptions:
 
     @property
     def particles(self) -> int:
-        """Most active particles at once: as asked for, else what this machine affords."""
+        """Most particles seen at once: as asked for, else what this machine affords."""
         return self.max_particles or (PARTICLES_CUDA if _has_cuda() else PARTICLES_CPU)
+
+    @property
+    def for_training(self) -> SimulationOptions:
+        """The same with as many particles as training affords, where no number was asked for."""
+        return replace(self, max_particles=self.max_particles or (TRAINED_CUDA if _has_cuda() else TRAINED_CPU))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,6 @@ from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.populations import cumulative, integral, number_density
 
-
 CANDIDATES = 5  # particles that may come into view, to one that is in view: at most so many are led along their way
 
 
