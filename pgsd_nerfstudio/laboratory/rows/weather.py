@@ -15,6 +15,7 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows import motion_costs as rows_motion_costs
 from pgsd_nerfstudio.laboratory.rows import weather_ground as rows_weather_ground
+from pgsd_nerfstudio.laboratory.rows import weather_water as rows_weather_water
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
@@ -49,12 +50,13 @@ def verify(quick: bool) -> list[Record]:
         *_first_second(scene, surface),
         _sun(scene),
         *rows_weather_ground.rows(quick),
+        *rows_weather_water.rows(quick),
     ]
 
 
 def bench(quick: bool) -> list[Record]:
     """Costs of weather; `quick` takes one second of few particles."""
-    return list(rows_motion_costs.costs(quick))
+    return [*rows_motion_costs.costs(quick), *rows_weather_water.costs(quick)]
 
 
 def _fog(scene: Scene) -> Iterator[Record]:
