@@ -38,14 +38,14 @@ def crowns_of(impacts: Impacts, seconds: float, camera: Cameras, white: Float[Te
         seconds: since the beginning of the weather.
         camera: one camera in metres.
         white: sRGB of water that scatters the light of the sky.
-        legibility: factor on the area that a crown covers, as Appearance.legibility.
+        legibility: as Appearance.legibility; crowns are wider by its fourth root, half as much as drops.
     """
     young = impacts.between(seconds - LIVES, seconds)
-    size = math.sqrt(legibility) * young.diameters * pixels_per_metre(young.places, camera)
+    size = legibility**0.25 * young.diameters * pixels_per_metre(young.places, camera)
     size = np.where(young.diameters > SMALLEST, size, 0.0)
     best = np.argsort(-size)[:MOST]
     young = young.select(best[size[best] > FAINT])
-    count, diameter = len(young), math.sqrt(legibility) * young.diameters[:, None]
+    count, diameter = len(young), legibility**0.25 * young.diameters[:, None]
     age = (seconds - young.times)[:, None] / LIVES
     radius = diameter * np.minimum((2 / 3) ** 0.25 * np.sqrt(2 * young.speeds[:, None] * LIVES * age / diameter), WIDEST)
     # Jets of a crown differ; the places of drops draw how.
