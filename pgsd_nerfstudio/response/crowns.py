@@ -19,7 +19,7 @@ from pgsd_nerfstudio.response.ring_arcs import pixels_per_metre
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-MOST = 400  # crowns in one view
+MOST = 300  # crowns in one view
 JETS = 9  # of a crown
 LIVES = 0.06  # s
 HEIGHT = 3.0  # of the highest jets in diameters of the drop

@@ -80,14 +80,17 @@ class MirroredScene:
             distance = torch.from_numpy(found["t_hit"].numpy())
             ground = (distance * directions[:, 2] < LIFT) & (distance < math.inf)
             # What is less than twice the lift above the water is its own ground.
-            onward = torch.where(ground, distance + AGAIN, 0.0)[:, None] * directions
-            found = self.surface.raycasting.cast_rays(queries(start + onward, directions)) if bool(ground.any()) else found
-            met = np.isfinite(found["t_hit"].numpy())
-            which = torch.from_numpy(found["primitive_ids"].numpy()[met].astype(np.int64))
-            u, v = torch.from_numpy(found["primitive_uvs"].numpy()[met]).unbind(1)
+            onward = start[ground] + (distance[ground] + AGAIN)[:, None] * directions[ground]
+            again = self.surface.raycasting.cast_rays(queries(onward, directions[ground]))
+            hits = {name: found[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
+            for name, values in hits.items():
+                values[ground.numpy()] = again[name].numpy()
+            met = np.isfinite(hits["t_hit"])
+            which = torch.from_numpy(hits["primitive_ids"][met].astype(np.int64))
+            u, v = torch.from_numpy(hits["primitive_uvs"][met]).unbind(1)
             corners = self.light[self.surface.triangles[which].long()]
             at = (torch.stack([1 - u - v, u, v], 1)[:, :, None] * corners).sum(1)
-            normals = torch.from_numpy(found["primitive_normals"].numpy()[met])
+            normals = torch.from_numpy(hits["primitive_normals"][met])
             hit = torch.from_numpy(met)
             under = ((normals * directions[hit]).sum(1) > 0) & (normals[:, 2] > 0.3)
             light[hit] = torch.where(under[:, None], UNDERSIDE * at, at)

@@ -45,6 +45,7 @@ STEEP, LEVEL = 0.75, 0.95  # upward part of a normal up to which no film mirrors
 FILLED = 0.5  # weight of the upward direction in the normal of a film
 ROUGH = 0.08  # standard deviation of a film's normal along each axis, before it is normalised
 LEAST_MIRRORED = 0.004  # share of mirrored light below which no ray is cast
+LEAST_WAVES = 0.05  # of the slopes of rings that is left, below which a Gaussian is still
 SHORT_WAVES = 500.0  # 1/m; wave number by which the slopes of rings are averaged over the size of a Gaussian
 LOWEST = 0.01  # sine of the least height above the horizon from which water mirrors light
 NEXT = 0.08  # m; the ground of an arc is the Gaussian within this distance
@@ -204,25 +205,29 @@ class PuddlesNow:
             weather: share of the full weather, 0..1.
         """
         puddles = self.puddles
+        light, kept = torch.zeros_like(towards), torch.zeros_like(towards[:, 0])
         under = self.share[ids].to(towards) * wet
-        pooled = (under > 0).nonzero()[:, 0]
+        smooth = torch.maximum(wet * puddles.film[ids].to(towards), under)
+        some = (smooth > LEAST_MIRRORED).nonzero()[:, 0]
+        ids, towards, smooth = ids[some], towards[some], smooth[some]
         facing = puddles.facing[ids].to(towards)
+        pooled = (under[some] > 0).nonzero()[:, 0]
         facing[pooled] = torch.tensor([0.0, 0.0, 1.0]).to(towards)
         if puddles.ripples is not None and puddles.rippling and len(pooled):
             which = ids[pooled]
-            slopes = puddles.ripples.slopes(puddles.points[which, :2].double().numpy(force=True), self.seconds)
             # Waves shorter than a Gaussian tilt its halves against each other.
-            own = torch.exp(-((SHORT_WAVES * puddles.sizes[which]) ** 2) / 2).numpy(force=True)
-            facing[pooled] = tilted(slopes * own[:, None]).to(towards)
-        cosine = (facing * towards).sum(1)
-        share = torch.maximum(wet * puddles.film[ids].to(towards), under) * puddles.mirrored(cosine)
-        light = torch.zeros_like(towards)
+            own = torch.exp(-((SHORT_WAVES * puddles.sizes[which]) ** 2) / 2)
+            fine = own > LEAST_WAVES
+            places = puddles.points[which[fine], :2].double().numpy(force=True)
+            slopes = puddles.ripples.slopes(places, self.seconds) * own[fine, None].double().numpy(force=True)
+            facing[pooled[fine]] = tilted(slopes).to(towards)
+        share = smooth * puddles.mirrored((facing * towards).sum(1))
         bright = (share > LEAST_MIRRORED).nonzero()[:, 0]
-        if len(bright):
-            away = reflected(towards[bright], facing[bright])
-            seen = puddles.seen(puddles.points[ids[bright]], away, weather)
-            light[bright] = share[bright, None] * seen.to(towards)
-        return light, share
+        away = reflected(towards[bright], facing[bright])
+        seen = puddles.seen(puddles.points[ids[bright]], away, weather).to(towards)
+        light[some[bright]] = share[bright, None] * seen
+        kept[some] = share
+        return light, kept
 
     def drawn(self, view: Viewpoint, below: Below, weather: float) -> Gaussians | None:
         """The rings and crowns of drops near a camera as Gaussians in scene units; None if it sees none.

@@ -15,7 +15,7 @@ from pgsd_nerfstudio.response.ripples import DT, STEEPEST, Ripples, crests
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
-MOST_RINGS = 240  # drawn in one view: those that are largest in the picture and steepest
+MOST_RINGS = 160  # drawn in one view: those that are largest in the picture and steepest
 ARCS = 14  # of each circle of a ring
 AGES = (0.015, 0.5)  # s, between which rings are drawn: before, water still splashes, and after, they are too flat to be seen
 FINEST = 0.5  # pixels between the two circles of a ring from which it is drawn

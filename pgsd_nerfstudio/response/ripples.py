@@ -23,6 +23,7 @@ WAVES = 0.05  # share of an impact's energy that goes into waves; a drop leaves 
 DEPTH = 0.006  # m, of the water of all rings
 SECONDS, RADIUS, DT, DR = 0.7, 0.3, 0.001, 0.0005  # length, reach and steps of the tables
 NEAR_GROUND = 0.03  # m; a drop that ends so near to the ground of a hollow has fallen into it
+MOST = 1500  # rings at a time, those of the deepest craters; what smaller drops add is lost among them
 STEEPEST = 0.5  # slope that linear waves do not exceed here
 BIN = 0.12  # m; edge of the squares by which points near a ring are found
 
@@ -78,8 +79,10 @@ class Ripples:
         key = bins[:, 0] * shape[1] + bins[:, 1]
         order = np.argsort(key, kind="stable")
         starts = np.searchsorted(key[order], np.arange(shape[0] * shape[1] + 1))
-        ages = seconds - self.times[first:last]
-        rings = (self.places[first:last], ages, self.depths[first:last], self.tables[first:last])
+        which = np.arange(first, last)
+        if len(which) > MOST:
+            which = which[np.argpartition(-self.depths[which], MOST)[:MOST]]
+        rings = (self.places[which], seconds - self.times[which], self.depths[which], self.tables[which])
         found = _add(np.ascontiguousarray(points[order]), starts, lower, shape, *rings, _tables())
         result[order] = found
         size = np.hypot(*result.T)[:, None]
