@@ -28,6 +28,7 @@ class Simulate(WeatherCommand):
         from pgsd_nerfstudio.physics.record.report import report
         from pgsd_nerfstudio.storage import atomic_write
         from pgsd_nerfstudio.surface.mesh import surface_of
+        from pgsd_nerfstudio.weather.adapting import adapted
         from pgsd_nerfstudio.weather.making import motion_of
         from pgsd_nerfstudio.weather.prepared_scene import prepare_scene
 
@@ -40,6 +41,9 @@ class Simulate(WeatherCommand):
         scene = self.open_scene()
         with refusing(ValueError, OSError):
             prepared = prepare_scene(scene)
+            effect, said = adapted(effect, prepared)
+            for remark in said:
+                say(remark)
             history = motion_of(prepared, surface_of(scene, prepared.rasterizer), effect, self.simulation)
         found = report(history, effect.material)
         found["scale"] = {"metres_per_unit": scene.frame.metres_per_unit, "source": scene.frame.source}

@@ -128,6 +128,9 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     active = _look(looks.active, wider * _flake_scales(looks.active, diameters), generator)
     if looks.active.opacity is None:
         shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one
+        # Parcels of all sizes are equally dense: each holds droplets in proportion to the area that it covers.
+        area = active.scales.prod(1) ** (2 / 3)
+        shadow = shadow.mean() * area / area.mean() if len(area) else shadow
         active = ParticleLook(opacity_of_extinction(shadow, active.scales), active.scales, active.rgb)
     collided = _look(looks.collided, _patch_scales(effect, diameters, particles.represents.cpu()), generator)
     # A patch is not wider than the surface around it, so that it does not hang over the edge of a table, and never so wide that

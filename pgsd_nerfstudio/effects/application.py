@@ -12,35 +12,33 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import EFFECTS, Appearance, Effect, StateLook, Wind
 from pgsd_nerfstudio.effects.haze import Haze
 from pgsd_nerfstudio.effects.matter import INTENSITIES, Emission, Material
 from pgsd_nerfstudio.effects.request import Request, Rgb
 from pgsd_nerfstudio.effects.surface_response import SurfaceResponse
+from pgsd_nerfstudio.effects.tint import in_matter, mixed_evenly
 
-GLITTER_TONES, GLITTER_OPACITIES = 0.20, 0.60
-"""Spreads of brightness and opacity if all particles glitter. The initial look bounds the brightness to 0.80-1, and within
-these bounds a spread of 0.20 gives the greatest contrast: a third of the particles are at the dull end, and a fifth have 0.95
-or more. At 0.60 a third of the snowflakes are opaque and the others are fainter."""
-HAZE_SHARE, MATTER_SHARE = 0.35, 0.6
-"""Part of the way from the base's haze colour to the particles' colour. Between flakes and drops the haze is mostly plain air;
-fog and dust are the haze themselves."""
+HAZE_SHARE, MATTER_SHARE = 0.35, 0.8
+"""Part of the way from the base's haze colour to its colour as dyed or tinted as the particles. Between flakes and drops the haze
+is mostly plain air; fog and dust are the haze themselves, with plain air between."""
 
 
 def applied(request: Request, *, base: Effect | None = None) -> Effect:
     """The effect that follows a request. A field at its default changes nothing; the others act as follows.
 
-    - `rgb`: colour of the active particles, and of the collided ones if `landed_rgb` is None. Haze and sky move towards it by
-      HAZE_SHARE, or by MATTER_SHARE for fog and sand.
-    - `landed_rgb`: colour of the collided particles.
+    - `rgb`: tints the active particles, and the collided ones if `landed_rgb` is None, as far as their matter takes a colour
+      (tint.py); if `dyed`, it is their colour. Haze and sky go the same way by HAZE_SHARE, for fog and sand by MATTER_SHARE.
+    - `landed_rgb`: the same for the collided particles alone.
     - `size`: see the docstring of the module.
     - `amount`: precipitation is multiplied by it, visibility is divided by it, within INTENSITIES. The parcels of fog stand for
       droplets of a given extinction: if they are smaller or hold more, there are more of them, so that none needs an opacity
       above 1.
     - `opacity`: factor for every particle, up to an opacity of 1. Fog takes its opacity from its extinction and keeps it.
-    - `glitter`: particles do not reflect, so they sparkle by contrast. Brightness and opacity of active particles vary more
-      from particle to particle, from the base's spreads (0) to GLITTER_TONES and GLITTER_OPACITIES (1).
+    - `glitter`, `glow`, `twinkle`: what active particles do with light as time goes by (StateLook has the same fields, with the
+      greater of the base's and the request's values). Droplets of fog have no facets and never glitter.
     - `fall_speed`: factor of the law of fall speeds. At the same precipitation slower particles are closer together.
     - `wind`: factor of mean wind, turbulence and eddy diffusivity. Gusts are a share of the mean wind and grow with it.
     - `tumbling`: factor of the speed of swaying at the same frequency, so that the circles are wider. Only snow sways by
@@ -63,6 +61,7 @@ def applied(request: Request, *, base: Effect | None = None) -> Effect:
         appearance=_appearance(request, base),
         haze=_haze(request, base),
         ambience=_ambience(request, base),
+        adaptation=_adaptation(request, base.adaptation),
         prompt=request.prompt,
     )
 
@@ -85,6 +84,8 @@ def remarks(request: Request, *, base: Effect | None = None) -> tuple[str, ...]:
         )
     if request.opacity != 1 and base.appearance.active.opacity is None:
         sentences.append(f"opacity {request.opacity:g} changes nothing: the opacity of {base.name} follows from its amount")
+    if request.glitter and not _has_facets(base):
+        sentences.append(f"glitter {request.glitter:g} changes nothing: droplets of {base.name} have no facets")
     if request.tumbling != 1 and base.wind.flutter == 0:
         sentences.append(f"tumbling {request.tumbling:g} changes nothing: {base.name} does not sway by itself")
     if request.accumulates and base.surface.landing != "stays":
@@ -162,30 +163,46 @@ def _appearance(request: Request, base: Effect) -> Appearance:
         active = replace(active, scale_per_diameter=_times(active.scale_per_diameter, request.size))
     active = replace(
         active,
-        rgb=request.rgb or active.rgb,
-        tone_spread=_towards(active.tone_spread, GLITTER_TONES, request.glitter),
-        opacity_spread=_towards(active.opacity_spread, GLITTER_OPACITIES, request.glitter),
+        rgb=_coloured(active.rgb, request.rgb, request, base),
+        glitter=max(active.glitter, request.glitter) if _has_facets(base) else active.glitter,
+        glow=max(active.glow, request.glow),
+        twinkle_hertz=max(active.twinkle_hertz, request.twinkle),
     )
-    collided = replace(collided, rgb=request.landed_rgb or request.rgb or collided.rgb)
+    collided = replace(collided, rgb=_coloured(collided.rgb, request.landed_rgb or request.rgb, request, base))
     if _vanishes(request, base.surface):
         collided = replace(collided, opacity=0.0)
     return replace(looks, active=active, collided=collided)
 
 
 def _haze(request: Request, base: Effect) -> Haze | None:
-    return None if base.haze is None else replace(base.haze, rgb=_tinted(base.haze.rgb, request, base))
+    return None if base.haze is None else replace(base.haze, rgb=_hazy(base.haze.rgb, request, base))
+
+
+def _adaptation(request: Request, adaptation: Adaptation) -> Adaptation:
+    if adaptation.visibility is None:
+        return adaptation
+    return replace(adaptation, visibility=min(max(adaptation.visibility / request.amount, 0.2), 100.0))
 
 
 def _ambience(request: Request, base: Effect) -> Ambience | None:
-    return None if base.ambience is None else replace(base.ambience, sky=_tinted(base.ambience.sky, request, base))
+    return None if base.ambience is None else replace(base.ambience, sky=_hazy(base.ambience.sky, request, base))
 
 
-def _tinted(own: Rgb, request: Request, base: Effect) -> Rgb:
+def _hazy(own: Rgb, request: Request, base: Effect) -> Rgb:
     if request.rgb is None:
         return own
     share = HAZE_SHARE if base.emission.precipitates else MATTER_SHARE
-    red, green, blue = (a + share * (b - a) for a, b in zip(own, request.rgb, strict=True))
-    return red, green, blue
+    return mixed_evenly(own, _coloured(own, request.rgb, request, base), share)
+
+
+def _coloured(own: Rgb, wanted: Rgb | None, request: Request, base: Effect) -> Rgb:
+    if wanted is None:
+        return own
+    return wanted if request.dyed else in_matter(own, wanted, base.emission.kind)
+
+
+def _has_facets(base: Effect) -> bool:
+    return base.emission.kind != "fog droplets"
 
 
 def _look(request: Request, state: StateLook) -> StateLook:
@@ -198,7 +215,3 @@ def _look(request: Request, state: StateLook) -> StateLook:
 def _times(axes: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
     long, short, thin = axes
     return long * factor, short * factor, thin * factor
-
-
-def _towards(least: float, most: float, share: float) -> float:
-    return least + share * max(most - least, 0.0)

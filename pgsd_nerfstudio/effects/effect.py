@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.haze import Haze
 from pgsd_nerfstudio.effects.matter import Dense, Emission, Material
@@ -68,6 +69,13 @@ class StateLook:
     """Colour, sRGB."""
     tone_spread: float = 0.04
     """Spread of the brightness from particle to particle; the brightness stays within 0.80-1."""
+    glitter: float = 0.0
+    """Part of the light, 0-1, that tumbling facets mirror: most of the time they are dull, and they flash where they mirror
+    light to the camera (dynamics.sparkle). The mean over particles stays."""
+    glow: float = 0.0
+    """Light that a particle sends out by itself, 0-1; at 1 it is several times as bright as a white one in the day."""
+    twinkle_hertz: float = 0.0
+    """Pulses per second, about which each particle has its own rate and phase; 0: steady."""
     settle_seconds: float = 0.0
     """Time after contact in which a particle takes on this look."""
 
@@ -78,16 +86,18 @@ class Appearance:
 
     active: StateLook = field(default_factory=StateLook)
     collided: StateLook = field(default_factory=StateLook)
+    widest_pixels: float | None = None
+    """Greatest standard deviation in pixels of what flies, across its way: grains near the lens are no balls. None: no bound."""
     exposure: float = 0.0
     """Shutter time in seconds: active particles are smeared by speed times this. 0 freezes them, as is usual for snow; rain and
     sand show streaks at 1/50 s."""
 
     legibility: float = 1.0
-    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature, which can be next to nothing."""
+    """Factor on the area of all that flies, 1-1000. At 1 it takes as much light as in nature, which can be next to nothing."""
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.legibility <= 100.0:
-            raise ValueError(f"legibility must lie in 1-100, got {self.legibility:g}; at 1 particles cover what they cover")
+        if not 1.0 <= self.legibility <= 1000.0:
+            raise ValueError(f"legibility must lie in 1-1000, got {self.legibility:g}; at 1 particles cover what they cover")
         if not 0.0 <= self.exposure <= 1.0:
             raise ValueError(f"exposure must lie in 0-1 s, got {self.exposure:g}; a film camera has about 0.02")
 
@@ -109,10 +119,21 @@ class Effect:
     """Medium between the particles; None: the air is clear."""
     ambience: Ambience | None = None
     """Change of the light of the whole scene; None: it stays as it is."""
+    adaptation: Adaptation = field(default_factory=Adaptation)
+    """Values that follow the scene where nobody asks for a number."""
     prompt: str
     """Prompt for the video model; {scene} stands for the description of the scene."""
     negative_prompt: str = ""
     """Prompt of what the video model should avoid."""
+
+    def with_intensity(self, intensity: float) -> Effect:
+        """The same weather at an intensity in its own unit, whatever the scene.
+
+        Raises:
+            ValueError: the intensity is out of its range.
+        """
+        fixed = replace(self.adaptation, visibility=None)
+        return replace(self, emission=replace(self.emission, intensity=intensity), adaptation=fixed)
 
     def prompt_for(self, description: str) -> str:
         """The prompt for a scene with this description, such as "a garden"."""
@@ -151,7 +172,7 @@ def effect(name: str, *, intensity: float | None = None, exposure: float | None 
     if chosen is None:
         raise ValueError(f"there is no effect {name!r}; known are: {', '.join(sorted(EFFECTS))}")
     if intensity is not None:
-        chosen = replace(chosen, emission=replace(chosen.emission, intensity=intensity))
+        chosen = chosen.with_intensity(intensity)
     if exposure is not None:
         chosen = replace(chosen, appearance=replace(chosen.appearance, exposure=exposure))
     return chosen

@@ -57,7 +57,7 @@ class EffectOptions:
     By default the provider's own, or what OPENAI_BASE_URL, ANTHROPIC_BASE_URL, ... say."""
     intensity: float | None = None
     """How much: snow and rain in mm/h of water (heavy snow 3, heavy rain 20).
-    Fog and sand as visibility in metres (dense fog 50). By default what effect or words say."""
+    Fog and sand as visibility in metres (dense fog 50); by default that follows how far away the scene's background is."""
     visibility: Visibility = "optical-range"
     """What visibility means: optical-range is that of weather services and roads, at which 5 % of the contrast are left
     (extinction ln 20 / visibility); koschmieder has 2 % left (ln 50 / visibility): for the same number thicker air."""
@@ -68,7 +68,8 @@ class EffectOptions:
     wind: float | None = None
     """Mean wind in m/s at 2 m above the ground, 0-40; gusts and turbulence follow it. By default what effect or words say."""
     wind_direction: float | None = None
-    """Where the wind blows to, in degrees counted from the x axis of the scene towards y. By default the effect's own."""
+    """Where the wind blows to, in degrees counted from the x axis of the scene towards y.
+    By default the effect's own, which for sand is across the view."""
     color: str | None = None
     """Colour of what flies and of what has landed, and a third of the haze's: #8040c0, purple, "dusty rose".
     By default what effect or words say."""
@@ -100,7 +101,7 @@ class EffectOptions:
     """Shutter time in seconds: active particles are smeared by speed times this (a film camera: 0.02).
     By default the effect's own, which for snow is 0, no motion blur."""
     legibility: float | None = None
-    """Factor on the area of all that flies, 1-100. At 1 it takes as much light as in nature: right for data sets and for
+    """Factor on the area of all that flies, 1-1000. At 1 it takes as much light as in nature: right for data sets and for
     comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking and said if it is not 1."""
 
     def __post_init__(self) -> None:
@@ -140,6 +141,7 @@ class EffectOptions:
             haze=self._haze(effect.haze),
             ambience=effect.ambience if self.ambience else None,
             appearance=self._appearance(effect.appearance),
+            adaptation=effect.adaptation if self.wind_direction is None else replace(effect.adaptation, wind_across=False),
         )
         return effect, [*said, *legible(effect)]
 
@@ -183,7 +185,7 @@ class EffectOptions:
         effect = applied(request)
         said += remarks(request)
         if self.intensity is not None:
-            effect = replace(effect, emission=replace(effect.emission, intensity=self.intensity))
+            effect = effect.with_intensity(self.intensity)
         if self.exposure is not None:
             effect = replace(effect, appearance=replace(effect.appearance, exposure=self.exposure))
         return effect, said

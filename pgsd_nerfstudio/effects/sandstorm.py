@@ -5,6 +5,7 @@ Sizes: the sand populations of desert soils of Tegen et al. (2002). Fall speeds:
 
 from __future__ import annotations
 
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Appearance, Effect, StateLook, Wind, register
 from pgsd_nerfstudio.effects.haze import Haze
@@ -17,7 +18,7 @@ QUARTZ = Material(mass_milligram=1.3875, mass_exponent=3.0, speed_law="sand")  #
 SANDSTORM = register(
     Effect(
         name="sandstorm",
-        emission=Emission(kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=1.0, share=0.3),
+        emission=Emission(kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=1.0, most=40_000, share=0.1),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
         timeline=Timeline(onset=5.0, arrives="as a front"),
@@ -36,19 +37,22 @@ SANDSTORM = register(
         dense=Dense(matter="sand", young=1e5, friction=0.6),
         appearance=Appearance(
             active=StateLook(
-                scale_m=(0.006, 0.006, 0.006),
+                scale_per_diameter=(0.36, 0.36, 0.36),
                 scale_spread=0.5,
                 opacity=0.97,
-                opacity_spread=0.15,
+                opacity_spread=0.0,
                 rgb=(0.90, 0.75, 0.53),
                 tone_spread=0.14,
             ),
             collided=StateLook(
                 scale_spread=0.4, opacity=0.35, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
             ),
-            exposure=1 / 150,
+            legibility=600.0,
+            widest_pixels=1.0,
+            exposure=1 / 50,
         ),
-        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=1.0, patch_size=5.0),
+        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.4, patch_size=16.0),
+        adaptation=Adaptation(visibility=2.0, wind_across=True),
         ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
         prompt="A sandstorm sweeps through {scene}, sand grains fly in the wind, dust hangs in the air and sand settles on "
         "surfaces. Photorealistic, high detail",

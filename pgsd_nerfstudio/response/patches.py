@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 NODES = 64  # along each side of the texture
-PERIOD = 4  # length of the texture in largest wavelengths
-OCTAVES = 2  # from the largest wavelength to a quarter of it; smaller patches average out along a ray
+PERIOD = 1  # length of the texture in largest wavelengths
+OCTAVES = 5  # from the largest wavelength to a thirty-second of it, the shortest that the nodes hold
 
 
 @dataclass(frozen=True, eq=False)

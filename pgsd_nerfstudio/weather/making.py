@@ -17,6 +17,7 @@ from pgsd_nerfstudio.response.prepare import answer_of, edits_of
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, surface_of
+from pgsd_nerfstudio.weather.adapting import adapted
 from pgsd_nerfstudio.weather.options import SimulationOptions
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene, prepare_scene
 from pgsd_nerfstudio.weather.weather import Weather
@@ -109,6 +110,9 @@ def make_weather(
         ValueError: the scene cannot hold this weather, or an edited picture cannot be used.
         OSError: the cache cannot be written.
     """
+    effect, said = adapted(effect, prepared)
+    for remark in said if progress else ():
+        console.print(remark, style="dim", markup=False)
     surface = surface_of(prepared.scene, prepared.rasterizer, progress=progress)
     history = motion_of(prepared, surface, effect, options, path=path, progress=progress).to(prepared.device)
     answer = answer_to(prepared, surface, effect, options, edited_images=edited_images).struck_by(history)
