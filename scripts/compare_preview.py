@@ -120,7 +120,7 @@ class Compare:
         for k in range(len(path)):
             at = round((k + 1) * (weather.frame_count - 1) / len(path))
             found = weather.render_frame(path[k], at).rgb
-            eye = Eye.of(frame.cameras_to_metric(path[k]), rasterizer.config, frame.metres_per_unit)
+            eye = Eye.of(path[k], rasterizer.config, frame)
             particles = frame.gaussians_to_scene(weather.sequence.gaussians(at, everybody, eye))
             with torch.no_grad():
                 rasterizer.render(path[k], None, None, weather.moment(at))

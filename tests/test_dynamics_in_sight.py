@@ -15,6 +15,7 @@ from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.trial import random_cameras
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 
@@ -27,7 +28,7 @@ def rolling(history, exposure: float, size: float) -> Rollout:
 
 
 def eye_of(camera: Cameras) -> Eye:
-    return Eye.of(camera, RasterConfig(), 1.0)
+    return Eye.of(camera, RasterConfig(), Frame(1.0, torch.eye(3), torch.zeros(3)))
 
 
 @pytest.mark.parametrize("exposure", [0.0, 0.03])

@@ -8,6 +8,7 @@ particle plus the way that it makes while the shutter is open.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numba
@@ -16,11 +17,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.physics.air.reach import FADE
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.scene.cameras import Cameras
+from pgsd_nerfstudio.scene.frame import Frame
+from pgsd_nerfstudio.scene.gaussians import Gaussians
 
 SPARE = 1.0  # pixels around the picture: single precision moves a centre by less
 
@@ -53,20 +57,22 @@ class Eye(NamedTuple):
         return -self.viewmat[:, :3].T @ self.viewmat[:, 3]
 
     @staticmethod
-    def of(camera: Cameras, config: RasterConfig, metres_per_unit: float) -> Eye:
+    def of(camera: Cameras, config: RasterConfig, frame: Frame) -> Eye:
         """The eye of a camera.
 
         Args:
-            camera: one camera in the metric frame (`Frame.cameras_to_metric`).
+            camera: one camera in scene units.
             config: rules of the rasterizer that will show what is kept; lengths in scene units.
-            metres_per_unit: of the scene.
+            frame: the metric frame of the scene.
 
         Raises:
             ValueError: there is not exactly one camera.
         """
         if len(camera) != 1:
             raise ValueError(f"an eye is one camera, got {len(camera)}")
-        viewmat = np.ascontiguousarray(camera.viewmats[0, :3].double().numpy(force=True))
+        metres_per_unit = frame.metres_per_unit
+        viewmat = frame.cameras_to_metric(camera).viewmats[0, :3].double().numpy(force=True)
+        viewmat = np.ascontiguousarray(viewmat)
         (focal_x, _, center_x), (_, focal_y, center_y) = camera.Ks[0, :2].tolist()
         sides = float(camera.width), float(camera.height)
         near, far = config.near * metres_per_unit, config.far * metres_per_unit
@@ -96,6 +102,21 @@ def fading_in(positions: Float[Tensor, "n 3"], reaches: Float[Tensor, " n"], cen
     """
     distances = (positions - center).norm(dim=1).clamp_min(1e-6)
     return ((reaches / distances - 1.0) / FADE).clamp(0.0, 1.0)
+
+
+def faded_in(instant: RolloutFrame, reaches: Float[Tensor, " p"], eye: Eye) -> Gaussians:
+    """The Gaussians of a frame as one camera sees them: flying particles within their reach; differentiable.
+
+    Args:
+        instant: of the roll-out.
+        reaches: `ParticleHistory.reaches`, metres.
+        eye: the camera.
+    """
+    gaussians, flying = instant.gaussians, len(instant.active)
+    center = torch.from_numpy(eye.center).to(gaussians.means)
+    near = fading_in(gaussians.means[:flying], reaches[instant.active], center)
+    factors = torch.cat([near, near.new_ones(len(gaussians) - flying)])
+    return replace(gaussians, opacities=gaussians.opacities * factors)
 
 
 def in_sight(

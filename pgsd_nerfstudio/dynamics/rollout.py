@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pgsd_nerfstudio.dynamics.field import DynamicsField
-from pgsd_nerfstudio.dynamics.in_sight import Extents, Eye, fading_in, in_sight
+from pgsd_nerfstudio.dynamics.in_sight import Extents, Eye, faded_in, in_sight
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_frame
 from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
@@ -178,9 +178,11 @@ class Rollout(GaussianSequence):
 
     def _at(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook, eye: Eye | None = None) -> RolloutFrame:
         if eye is None or visible is not None or not self.field.still() or self.history.device.type != "cpu":
-            return self._rendered(self._reach(frame, visible, look), look, None, eye)
-        chosen = in_sight(self.history, frame, self._extents(look), self.exposure, eye)
-        return self._rendered(simulated_of(self.history, frame, *chosen), look, None, eye)
+            found = self._rendered(self._reach(frame, visible, look), look, None)
+        else:
+            chosen = in_sight(self.history, frame, self._extents(look), self.exposure, eye)
+            found = self._rendered(simulated_of(self.history, frame, *chosen), look, None)
+        return found if eye is None else replace(found, gaussians=faded_in(found, self.history.reaches, eye))
 
     def _extents(self, look: InitialLook) -> Extents:
         """Sizes of the particles; those of the initial look are kept."""
@@ -227,16 +229,13 @@ class Rollout(GaussianSequence):
             state, _ = advance(state, few, look, self.field, None, self._flow)
         return replace(state, active=active, collided=kept.collided, collided_change=kept.collided_change)
 
-    def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None, eye: Eye | None = None) -> RolloutFrame:
+    def _rendered(self, state: RolloutState, look: InitialLook, deltas: Deltas | None) -> RolloutFrame:
         history = self.history
         fade = fading(history, state.frame, state.active)
         offset = state.offset * fade[:, None]
         active = changed(look.active.select(state.active), state.active_change.times(fade))
         collided = changed(look.collided_at(history, state.frame, state.collided), state.collided_change)
         places = history.positions_at(state.frame, state.active) + offset
-        if eye is not None:
-            near = fading_in(places, history.reaches[state.active], torch.from_numpy(eye.center).to(places))
-            active = ParticleLook(active.opacity * near, active.scales, active.rgb)
         looks = ParticleLook(*(torch.cat(pair) for pair in zip(_fields(active), _fields(collided), strict=True)))
         gaussians = Gaussians(
             torch.cat([places, history.rest_positions[state.collided]]),

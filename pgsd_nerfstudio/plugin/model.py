@@ -153,10 +153,15 @@ class WeatherModel(SplatfactoModel):
             )
         return loaded
 
-    def weather_at(self, frame: int) -> Gaussians:
-        """The weather's Gaussians in scene units at a frame of its time line, learned refinements included."""
+    def weather_at(self, frame: int, camera: Cameras | None = None) -> Gaussians:
+        """The weather's Gaussians in scene units at a frame of its time line, learned refinements included.
+
+        Args:
+            frame: number of the frame.
+            camera: one camera that will see them, as for `Weather.gaussians`; None: all of them.
+        """
         with uninterrupted():
-            return self.made.gaussians(frame)
+            return self.made.gaussians(frame, camera)
 
     def moment(self, frame: int, answer: Answer | None = None) -> Shown | None:
         """How the frozen scene looks at a frame; None: as it was trained."""
@@ -179,7 +184,7 @@ class WeatherModel(SplatfactoModel):
             )
         frame = self.moments.of(camera)
         answer = self.weather.adjusted_answer(self.answer)
-        return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame)), obb_box, answer, frame))
+        return self._outputs(self.render(views, self.weather.adjusted(self.weather_at(frame, views)), obb_box, answer, frame))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Tensor]:
         """As `get_outputs_for_camera`; rays, which ns-export pointcloud, tsdf, poisson and marching-cubes ask for, are refused.

@@ -22,6 +22,7 @@ from rich.console import Console
 from torch import Tensor
 
 from pgsd_nerfstudio.dynamics import Begin, Gap, Rollout, drift, gaps, regularization
+from pgsd_nerfstudio.dynamics.in_sight import Eye, faded_in
 from pgsd_nerfstudio.guidance.distillation import DistilledClip
 from pgsd_nerfstudio.guidance.schedules import regularization_scale
 from pgsd_nerfstudio.plugin.clip import Stopwatch, render_clip, seen_by, surrogate
@@ -147,7 +148,11 @@ class WeatherPipeline(VanillaPipeline):
             seen = None if options.motion.motion == "deformation" else seen_by(prepared, views, model.history, start)
             how = {"begin": options.motion.begin, "gradient_frames": options.motion.gradient_frames}
             instants = model.rollout.window(start, len(views), visible=seen, **how)
-            weather = [prepared.scene.frame.gaussians_to_scene(one.gaussians) for one in instants]
+            place, config = prepared.scene.frame, prepared.clip_rasterizer.config
+            eyes = [Eye.of(views[k], config, place) for k in range(len(views))]
+            reaches = model.history.reaches
+            shown = [faded_in(one, reaches, eye) for one, eye in zip(instants, eyes, strict=True)]
+            weather = [place.gaussians_to_scene(one) for one in shown]
         with watch("render"):
             answering = options.answering_clips
             moments = [model.moment(start + k) if answering else None for k in range(len(views))]

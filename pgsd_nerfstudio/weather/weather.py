@@ -109,9 +109,8 @@ class Weather:
             IndexError: there is no such frame.
             ValueError: there is not exactly one camera.
         """
-        place, eye = self.scene.frame, None
-        if camera is not None:
-            eye = Eye.of(place.cameras_to_metric(camera), self.prepared.rasterizer.config, place.metres_per_unit)
+        place = self.scene.frame
+        eye = None if camera is None else Eye.of(camera, self.prepared.rasterizer.config, place)
         with torch.no_grad():
             return place.gaussians_to_scene(self.sequence.gaussians(frame, eye=eye))
 
