@@ -48,6 +48,8 @@ class Compare:
     data: Path | None = None
     """As for pgsd preview."""
     effect: str = "snowfall"
+    views: tuple[int, int] = (0, 1)
+    """Training views between which the camera moves; builds may choose differently by themselves."""
     counts: tuple[int, ...] = (2_000, 20_000, 200_000)
     """Values of --max-particles."""
     seconds: float = 4.0
@@ -88,6 +90,7 @@ class Compare:
         command = [str(program), "preview", "--load-scene", str(self.load_scene.resolve()), "--effect", self.effect]
         command += [] if self.data is None else ["--data", str(self.data.resolve())]
         command += ["--seconds", f"{self.seconds:g}", "--frames", str(self.frames), "--max-particles", str(count)]
+        command += ["--views", *map(str, self.views)]
         command += ["--width", str(SIDE), "--height", str(SIDE), "--output", str(cache / f"{count}.mp4")]
         environment = {**os.environ, "PGSD_CACHE": str(cache), "NUMBA_CACHE_DIR": str(cache / "kernels")}
         began = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -114,7 +117,7 @@ class Compare:
             effect(self.effect),
             SimulationOptions(seconds=self.seconds, max_particles=count),
         )
-        path = slow_path(weather.scene, frames=3, fps=1.0, start=0).resized(SIDE, SIDE)
+        path = slow_path(weather.scene, frames=3, fps=1.0, start=0, views=self.views).resized(SIDE, SIDE)
         worst, frame, rasterizer = float("inf"), weather.scene.frame, weather.prepared.rasterizer
         everybody = torch.ones(len(weather.history), dtype=torch.bool)
         for k in range(len(path)):
