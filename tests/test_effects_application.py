@@ -23,6 +23,7 @@ from pgsd_nerfstudio.effects.options import EffectOptions
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.effects.request import BASES, LIMITS, Request
 from pgsd_nerfstudio.effects.timeline import Timeline
+from pgsd_nerfstudio.effects.tint import in_matter, mixed_evenly
 from pgsd_nerfstudio.effects.vocabulary import KINDS
 from pgsd_nerfstudio.physics import Clock, Domain, simulate_metric
 from pgsd_nerfstudio.physics.air.emitters import Sizes
@@ -85,11 +86,11 @@ def _ratio(new: Any, old: Any) -> Any:
 
 
 def purple(base: Effect) -> dict[str, Any]:
-    """What a purple request changes: air and sky go 35 % of the way between flakes and drops, 60 % where they are matter."""
-    share = 0.35 if base.emission.precipitates else 0.6
+    """What purple dye changes: air and sky go 35 % of the way between flakes and drops, 80 % where they are matter."""
+    share = 0.35 if base.emission.precipitates else 0.8
     owns = {"haze.rgb": base.haze.rgb, "ambience.sky": base.ambience.sky} if base.haze and base.ambience else {}
     air = {
-        name: tuple(round(((1 - share) * old + share * new) / old, 9) for old, new in zip(own, PURPLE, strict=True))
+        name: tuple(round(new / old, 9) for old, new in zip(own, mixed_evenly(own, PURPLE, share), strict=True))
         for name, own in owns.items()
     }
     assert air
@@ -98,8 +99,8 @@ def purple(base: Effect) -> dict[str, Any]:
 
 TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
     *((base, {}, {}) for base in EFFECTS.values()),
-    *((base, {"rgb": PURPLE}, purple(base)) for base in EFFECTS.values()),
-    *((base, {"landed_rgb": PURPLE}, {"appearance.collided.rgb": PURPLE}) for base in EFFECTS.values()),
+    *((base, {"rgb": PURPLE, "dyed": True}, purple(base)) for base in EFFECTS.values()),
+    *((base, {"landed_rgb": PURPLE, "dyed": True}, {"appearance.collided.rgb": PURPLE}) for base in EFFECTS.values()),
     (
         SNOWFALL,
         {"size": 2.0},
@@ -111,14 +112,15 @@ TURNED: list[tuple[Effect, dict[str, Any], dict[str, Any]]] = [
         },
     ),
     (RAINFALL, {"size": 3.0}, {"appearance.active.scale_per_diameter": (3.0, 3.0, 3.0)}),
-    (SANDSTORM, {"size": 0.5}, {"appearance.active.scale_m": (0.5, 0.5, 0.5)}),
+    (SANDSTORM, {"size": 0.5}, {"appearance.active.scale_per_diameter": (0.5, 0.5, 0.5)}),
     (FOG, {"size": 2.0}, {"appearance.active.scale_m": (2.0, 2.0, 2.0)}),
     (FOG, {"size": 0.5}, {"appearance.active.scale_m": (0.5, 0.5, 0.5), "emission.most": 4.0}),
     (SNOWFALL, {"amount": 3.0}, {"emission.intensity": 3.0}),
     (RAINFALL, {"amount": 0.5}, {"emission.intensity": 0.5}),
-    (SANDSTORM, {"amount": 2.0}, {"emission.intensity": 0.5}),
-    (FOG, {"amount": 0.5}, {"emission.intensity": 2.0}),
-    (FOG, {"amount": 2.0}, {"emission.intensity": 0.5, "emission.most": 2.0}),
+    # Where the visibility follows the scene, its multiple follows the amount.
+    (SANDSTORM, {"amount": 2.0}, {"emission.intensity": 0.5, "adaptation.visibility": 0.5}),
+    (FOG, {"amount": 0.5}, {"emission.intensity": 2.0, "adaptation.visibility": 2.0}),
+    (FOG, {"amount": 2.0}, {"emission.intensity": 0.5, "emission.most": 2.0, "adaptation.visibility": 0.5}),
     (SNOWFALL, {"opacity": 0.5}, {"appearance.active.opacity": 0.5, "appearance.collided.opacity": 0.5}),
     (FOG, {"opacity": 0.5}, {"appearance.collided.opacity": 0.5}),
     *((base, {"fall_speed": 0.4}, {"material.speed_factor": 0.4}) for base in EFFECTS.values()),
@@ -213,23 +215,21 @@ def test_no_parcel_of_fog_has_to_be_darker_than_opaque():
 
 
 @pytest.mark.parametrize("base", [SNOWFALL, RAINFALL, SANDSTORM])
-def test_the_more_it_glitters_the_more_particles_differ(base):
-    # From the same spreads, whatever the effect's own are.
-    alike = replace(base.appearance.active, tone_spread=0.04, opacity=0.8, opacity_spread=0.1)
-    base = replace(base, appearance=replace(base.appearance, active=alike))
-    looks = [look(applied(request(glitter=share), base=base)) for share in (0.0, 0.3, 0.7, 1.0)]
-    for quantity in ("opacity", "rgb"):
-        spreads = [float(getattr(each.active, quantity).std(0).min()) for each in looks]
-        assert spreads == sorted(set(spreads)), quantity
-        assert spreads[-1] > 1.2 * spreads[0]
-        assert all(torch.equal(getattr(each.collided, quantity), getattr(looks[0].collided, quantity)) for each in looks)
-    brightest = [float(each.active.rgb.amax(1).max()) for each in looks]
-    assert brightest == pytest.approx(brightest[:1] * 4, rel=0.02)  # the others get dull
+def test_lights_are_those_of_the_active_particles_and_none_gets_weaker(base):
+    """Particles differ by what they mirror at a moment (dynamics.sparkle), no longer by brightness and opacity for good."""
+    effect = applied(request(base.name, glitter=0.7, glow=0.4, twinkle=2.0))
+    assert changes(effect, base) == {
+        "appearance.active.glitter": 0.7,
+        "appearance.active.glow": 0.4,
+        "appearance.active.twinkle_hertz": 2.0,
+    }
+    assert applied(request(base.name, glitter=0.1), base=effect).appearance == effect.appearance
 
 
-def test_a_base_that_varies_more_than_glitter_does_keeps_that():
-    wild = replace(SNOWFALL.appearance, active=replace(SNOWFALL.appearance.active, tone_spread=0.9, opacity_spread=0.9))
-    assert applied(request(glitter=1.0), base=replace(SNOWFALL, appearance=wild)).appearance == wild
+def test_fog_has_no_facets():
+    asked = request("fog", glitter=0.5)
+    assert applied(asked).appearance == FOG.appearance
+    assert remarks(asked) == ("glitter 0.5 changes nothing: droplets of fog have no facets",)
 
 
 @pytest.mark.parametrize("base", EFFECTS.values())
@@ -285,7 +285,7 @@ def test_the_ends_of_all_ranges_together_give_effects_with_lawful_numbers(base):
 def test_the_ends_of_each_range_give_looks_that_can_be_drawn(base):
     everything = [{name: limits[end] for name, limits in LIMITS.items()} for end in (0, 1)]
     for said in [*everything, *({name: value} for name, limits in LIMITS.items() for value in limits)]:
-        effect = applied(request(base, rgb=PURPLE, landed_rgb=(0.0, 1.0, 0.0), accumulates=False, **said))
+        effect = applied(request(base, rgb=PURPLE, landed_rgb=(0.0, 1.0, 0.0), dyed=True, accumulates=False, **said))
         found = look(effect)
         for state in (found.active, found.collided):
             assert 0 < state.opacity.min() <= state.opacity.max() < 1
@@ -339,12 +339,13 @@ def test_a_preview_in_words_says_what_it_understood_and_shows_that(yard, tmp_pat
     said = " ".join(capsys.readouterr().err.split())
     rain, snow = made
     assert rain == applied(read("heavy purple blorp rain that accumulates").request)
-    assert rain.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
+    for effect, own in ((rain, RAINFALL), (snow, SNOWFALL)):  # matter in that colour, not the colour of a display
+        tinted = in_matter(own.appearance.active.rgb, (128 / 255, 0, 128 / 255), own.emission.kind)
+        assert effect.appearance.active.rgb == pytest.approx(tinted, abs=1e-6)
     assert "understood rain = rainfall; heavy = amount 2; purple = colour (0.50, 0.00, 0.50)" in said
     assert "Ignored: blorp" in said
     assert "nothing will accumulate: rainfall wets surfaces" in said
     assert (snow.emission.intensity, snow.appearance.exposure) == (0.7, 0.01)
-    assert snow.appearance.active.rgb == pytest.approx((0.5, 0, 0.5), abs=0.01)
 
 
 def test_particles_that_shall_not_accumulate_vanish_where_they_land():

@@ -27,6 +27,7 @@ from pgsd_nerfstudio.effects.application import applied
 from pgsd_nerfstudio.effects.haze import Haze
 from pgsd_nerfstudio.effects.options import EffectOptions, colour_of
 from pgsd_nerfstudio.effects.reader import read
+from pgsd_nerfstudio.effects.tint import in_matter, mixed_evenly
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.laws.populations import extinction, fall_speed, integral, number_density
 from pgsd_nerfstudio.plugin.options import RunOptions
@@ -121,15 +122,18 @@ def test_wind_after_words_of_still_air_has_turbulence_again():
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("text", ["purple", "Purple", "#800080", "#800080".upper()])
 def test_a_colour_by_name_is_that_colour_in_hexadecimal(name, text):
-    effect = turned(name, color=text)
-    for state in (effect.appearance.active, effect.appearance.collided):
-        assert state.rgb == pytest.approx((128 / 255, 0, 128 / 255))
+    """It tints the effect's matter, as words do: lit matter is no colour of a display."""
+    effect, own, purple = turned(name, color=text), EFFECTS[name], (128 / 255, 0, 128 / 255)
+    for state, plain in (
+        (effect.appearance.active, own.appearance.active),
+        (effect.appearance.collided, own.appearance.collided),
+    ):
+        assert state.rgb == pytest.approx(in_matter(plain.rgb, purple, own.emission.kind))
     assert effect == turned(name, color="purple")
     hazy = replace(Haze(), rgb=(0.5, 0.5, 0.5))
     mixed = applied(read("purple snow").request, base=replace(SNOWFALL, haze=hazy)).haze
-    assert mixed is not None and mixed.rgb == pytest.approx(
-        (0.65 * 0.5 + 0.35 * 128 / 255, 0.65 * 0.5, 0.65 * 0.5 + 0.35 * 128 / 255)
-    )
+    tinted = in_matter(hazy.rgb, (128 / 255, 0, 128 / 255), "snowflakes")
+    assert mixed is not None and mixed.rgb == pytest.approx(mixed_evenly(hazy.rgb, tinted, 0.35))
 
 
 def test_short_hexadecimal_is_written_out_and_names_of_the_survey_are_known():
@@ -325,7 +329,8 @@ def test_a_language_model_is_asked_once_and_said_to_have_been(protocol, tmp_path
         assert knobs.resolve(tmp_path) == (effect, remarks)
         assert len(server.asked) == 1
     assert remarks == [f"{server.model} was asked what 'purple snow' means: snowfall, rgb (0.50, 0.00, 0.50), glitter 0.3"]
-    assert effect.appearance.collided.rgb == (0.5, 0.0, 0.5) and effect.prompt == GOOD["prompt"]
+    tinted = in_matter(SNOWFALL.appearance.collided.rgb, (0.5, 0.0, 0.5), "snowflakes")
+    assert effect.appearance.collided.rgb == tinted and effect.prompt == GOOD["prompt"]
     assert effect.emission.largest == 2 * SNOWFALL.emission.largest
     (kept,) = tmp_path.iterdir()
     assert kept.name.startswith("request-") and json.loads(kept.read_text("utf-8"))["prompt"] == "purple snow"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
 
-from pgsd_nerfstudio.effects.reader import read
+from pgsd_nerfstudio.effects.reader import LIGHTS, read
 from pgsd_nerfstudio.effects.request import LIMITS, SCHEMA, Request
 from pgsd_nerfstudio.effects.vocabulary import KINDS, QUALITIES, TINTS, WINDS, colour, mixed, tinted
 from pgsd_nerfstudio.storage import content_key
@@ -103,8 +103,9 @@ def test_a_request_is_plain_frozen_and_cannot_leave_its_limits():
         replace(request, size=6.0)
     assert content_key(request) == content_key(Request(**LEAST)) != content_key(replace(request, size=2.0))
     # Said nothing, nothing changes: factors are 1, the rest is the base's.
-    assert {getattr(request, name) for name in LIMITS if name != "glitter"} == {1.0}
-    assert (request.rgb, request.landed_rgb, request.accumulates, request.glitter) == (None, None, None, 0.0)
+    assert {getattr(request, name) for name in LIMITS if name not in LIGHTS} == {1.0}
+    assert {getattr(request, name) for name in LIGHTS} == {0.0}
+    assert (request.rgb, request.landed_rgb, request.accumulates, request.dyed) == (None, None, None, False)
 
 
 # What a person finds in a text.
@@ -114,7 +115,8 @@ def test_a_request_is_plain_frozen_and_cannot_leave_its_limits():
     ("text", "base", "name", "more"),
     [
         ("purple snow", "snowfall", "purple", {}),
-        ("glittering yellow sand", "sandstorm", "yellow", {"glitter": 0.7}),
+        ("glittering yellow sand", "sandstorm", "yellow", {"glitter": 0.7, "glow": 0.0, "twinkle": 0.0, "dyed": False}),
+        ("glowing, blinking red confetti", "snowfall", "red", {"glitter": 0.0, "glow": 0.6, "twinkle": 1.5, "dyed": True}),
         ("light snow", "snowfall", None, {"amount": 0.4}),
         ("light blue snow", "snowfall", "lightblue", {}),
         ("Turquoise FOG", "fog", "turquoise", {}),
@@ -184,7 +186,8 @@ def test_degrees_strengthen_and_weaken():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("magic particles without glitter", {"glitter": 0.0}),
+        ("magic particles without glitter", {"glitter": 0.0, "glow": 0.8}),
+        ("magic particles, not glowing, not blinking", {"glow": 0.0, "twinkle": 0.0}),
         ("fairy snow with no glitter or wind", {"glitter": 0.0, "wind": 0.0}),
         ("snow that doesn't settle", {"accumulates": False}),
         ("snow that never melts", {"accumulates": True}),

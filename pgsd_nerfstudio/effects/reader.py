@@ -12,14 +12,18 @@ from dataclasses import dataclass, field
 
 from matplotlib.colors import CSS4_COLORS
 
+from pgsd_nerfstudio.effects.effect import EFFECTS
 from pgsd_nerfstudio.effects.grammar import LINKS, PLACES, Item, Phrase, parse
 from pgsd_nerfstudio.effects.request import LIMITS, Base, Request, Rgb
+from pgsd_nerfstudio.effects.tint import in_matter
 from pgsd_nerfstudio.effects.vocabulary import KINDS, NOMINAL, QUALITIES, WINDS, Kind, forms, mixed, tinted
 
 NO_WEATHER = (
     "names nothing that could be in the air; say what falls or drifts, such as: purple snow, heavy rain, thin pale fog, "
     "glittering yellow sand, slowly falling ash, pink petals, magic particles"
 )
+SHARES = ("glitter", "glow")
+LIGHTS = (*SHARES, "twinkle")  # what particles do with light, which they do not unless it is said
 LONGEST = 400  # characters; a video model reads about 226 tokens
 MOTION: dict[Base, str] = {
     "snowfall": "falling in",
@@ -141,7 +145,7 @@ class Findings:
             wanted = {"wind": next((wanted[name] for name in ("wind", "amount", "size", "fall_speed") if name in wanted), 1.0)}
         for name, value in wanted.items():
             if not isinstance(value, bool):
-                wanted[name] = 1 - (1 - value) ** degree if name == "glitter" else value**degree
+                wanted[name] = 1 - (1 - value) ** degree if name in SHARES else value**degree
         if item.wind:
             wanted["wind"] = item.wind
         if item.kind:
@@ -157,7 +161,7 @@ class Findings:
     def _deny(self, item: Item) -> None:
         """Add a negated word. Some qualities have a clear opposite; "not heavy" has none and is ignored."""
         quality = item.quality or {}
-        denied: dict[str, float | bool] = {name: 0.0 for name in ("glitter", "tumbling") if name in quality}
+        denied: dict[str, float | bool] = {name: 0.0 for name in (*LIGHTS, "tumbling") if name in quality}
         if item.wind or (quality.get("wind", 0) > 1 and not item.kind):
             denied["wind"] = 0.0
         if "accumulates" in quality:
@@ -168,12 +172,12 @@ class Findings:
 
 
 def _combine(factors: dict[str, float | bool], more: dict[str, float | bool]) -> None:
-    """Add `more` to `factors`: factors multiply, the greater glitter counts, the last truth value counts."""
+    """Add `more` to `factors`: factors multiply, the greater glitter, glow and twinkle count, the last truth value counts."""
     for name, value in more.items():
         if isinstance(value, bool) or name not in factors:
             factors[name] = value
         else:
-            factors[name] = max(factors[name], value) if name == "glitter" else factors[name] * value
+            factors[name] = max(factors[name], value) if name in LIGHTS else factors[name] * value
 
 
 def _said(factor: tuple[str, float | bool]) -> str:
@@ -195,7 +199,13 @@ def _meant(word: str, known: list[str] | dict[str, Kind]) -> str | None:
 
 
 def _request(findings: Findings, kind: Kind, wanted: str) -> Request:
-    rgb = mixed(findings.colours) if findings.colours else kind.rgb
+    rgb, dyed = kind.rgb, kind.dyed or kind.rgb is not None
+    if findings.colours:
+        rgb = mixed(findings.colours)
+        if kind.rgb is not None and not kind.dyed:
+            rgb = in_matter(kind.rgb, rgb, EFFECTS[kind.base].emission.kind)
+    elif findings.tints:
+        dyed = True  # of its own colour, so that there is nothing to tint
     for tint, degree in findings.tints:
         rgb = tinted(rgb or NOMINAL[kind.base], tint, degree)
     values = dict(kind.factors)
@@ -211,6 +221,7 @@ def _request(findings: Findings, kind: Kind, wanted: str) -> Request:
         base=kind.base,
         rgb=rgb,
         landed_rgb=kind.landed_rgb or rgb,
+        dyed=dyed and rgb is not None,
         prompt=_sentence(wanted, kind.base, values.get("accumulates")),
         **values,  # pyright: ignore[reportArgumentType]
     )

@@ -31,9 +31,13 @@ class Request:
     """The effect that moves most like it: snowfall (sways down slowly, lands, accumulates), rainfall (falls fast, wets), fog
     (hangs and drifts), sandstorm (moves sideways with the wind). null: the text names nothing that could be in the air."""
     rgb: Rgb | None = None
-    """Colour of the particles in the air, sRGB. null keeps the base's."""
+    """Colour of the particles in the air, sRGB. null keeps the base's. By default it tints the base's matter: purple snow is
+    nearly as bright as snow."""
     landed_rgb: Rgb | None = None
     """Colour of the particles that have landed, sRGB. null: the colour of those in the air."""
+    dyed: bool = False
+    """Whether the colours are those of the particles' own matter, exactly, since they are no snow, rain, fog or sand: petals,
+    leaves, confetti, ash, smoke, embers."""
     size: Annotated[float, Field(ge=0.2, le=5)] = 1.0
     """Factor on the diameter of the particles (the base's snowflakes have 1.5-12 mm)."""
     amount: Annotated[float, Field(ge=0.1, le=5)] = 1.0
@@ -41,7 +45,11 @@ class Request:
     opacity: Annotated[float, Field(ge=0.1, le=2)] = 1.0
     """Factor on the opacity of each particle."""
     glitter: Share = 0.0
-    """Share of the particles that sparkle, and how strongly: 0 none, 0.7 glittering, 1 all of them brightly."""
+    """How much the particles flash as they turn, by mirroring light: 0 not at all, 0.7 glittering, 1 like tinsel."""
+    glow: Share = 0.0
+    """How much light the particles send out themselves: 0 none, 0.5 glowing, 1 embers, fireflies, magic."""
+    twinkle: Annotated[float, Field(ge=0, le=5)] = 0.0
+    """Pulses of each particle's brightness per second: 0 steady, 0.5 fireflies, 1 magic, 2 stars."""
     fall_speed: Annotated[float, Field(ge=0.2, le=3)] = 1.0
     """Factor on the speed of falling in still air."""
     wind: Annotated[float, Field(ge=0, le=3)] = 1.0

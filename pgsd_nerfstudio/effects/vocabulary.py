@@ -32,10 +32,12 @@ class Kind:
     rank: int = 2
     """If a text names several kinds, the highest rank is meant: 3 petals, ash; 2 snow, rain; 1 snowy, shower, particles; 0
     storm."""
+    dyed: bool = False
+    """Whether a named colour is the particles' own (red petals, black smoke); else it tints their matter (purple snow)."""
 
 
 def _particle(rgb: Rgb | None = None, landed_rgb: Rgb | None = None, **factors: float | bool) -> Kind:
-    return Kind("snowfall", rgb, landed_rgb, factors, rank=3)
+    return Kind("snowfall", rgb, landed_rgb, factors, rank=3, dyed=True)
 
 
 ASH, SOOT, SMOKE = (0.42, 0.41, 0.4), (0.3, 0.29, 0.28), (0.45, 0.44, 0.43)
@@ -49,13 +51,13 @@ KINDS: dict[str, Kind] = _spread(
     ),
     ("fog, mist", Kind("fog")),
     ("haze", Kind("fog", factors={"amount": 0.3})),
-    ("smoke", Kind("fog", SMOKE, factors={"tumbling": 1.5})),
-    ("smog", Kind("fog", (0.66, 0.61, 0.52))),
+    ("smoke", Kind("fog", SMOKE, factors={"tumbling": 1.5}, dyed=True)),
+    ("smog", Kind("fog", (0.66, 0.61, 0.52), dyed=True)),
     ("steam, vapour, vapor", Kind("fog", (0.96, 0.96, 0.97), factors={"amount": 0.7})),
     ("sand, sandstorm, dust storm, duststorm, haboob", Kind("sandstorm")),
     ("dust", Kind("sandstorm", factors={"size": 0.5, "amount": 0.5, "wind": 0.4})),
     ("ash, ashes, ashfall, soot, cinder", _particle(ASH, size=0.8, fall_speed=0.5)),
-    ("ember, spark", _particle((1.0, 0.5, 0.12), SOOT, size=0.4, amount=0.5, fall_speed=0.3, glitter=0.9)),
+    ("ember, spark", _particle((1.0, 0.5, 0.12), SOOT, size=0.4, amount=0.5, fall_speed=0.3, glow=1.0, twinkle=2.0)),
     (
         "petal, blossom, cherry blossom, cherry petal, rose petal",
         _particle((0.98, 0.74, 0.82), size=2.0, amount=0.4, fall_speed=0.8, tumbling=3.0),
@@ -70,17 +72,24 @@ KINDS: dict[str, Kind] = _spread(
     ("dandelion seed, dandelion, fluff", _particle(size=1.5, amount=0.2, fall_speed=0.4)),
     ("dust mote, mote", _particle((0.9, 0.86, 0.76), size=0.2, amount=0.4, fall_speed=0.2, wind=0.3)),
     (
-        "magic particle, magical particle, magic dust, fairy dust, pixie dust, stardust, star dust, firefly",
-        _particle((0.8, 0.65, 1.0), fall_speed=0.4, tumbling=2.0, glitter=0.8, accumulates=False),
+        "magic particle, magical particle, magic dust, fairy dust, pixie dust, stardust, star dust",
+        _particle((0.8, 0.65, 1.0), amount=0.4, fall_speed=0.4, tumbling=2.0, glow=0.8, twinkle=1.0, accumulates=False),
+    ),
+    (
+        "firefly",
+        _particle(
+            (0.85, 1.0, 0.35), amount=0.1, fall_speed=0.2, wind=0.3, tumbling=3.0, glow=1.0, twinkle=0.5, accumulates=False
+        ),
     ),
     ("snowy, wintry, blizzard, snowstorm, whiteout, flurry", Kind("snowfall", rank=1)),
     ("rainy, drop, droplet, shower, drizzle, drizzling, downpour, cloudburst, monsoon, pouring", Kind("rainfall", rank=1)),
     ("thunderstorm, rainstorm, hurricane, typhoon", Kind("rainfall", rank=1)),
     ("foggy, misty, hazy, cloudy, cloud", Kind("fog", rank=1)),
-    ("smoky", Kind("fog", SMOKE, rank=1)),
+    ("smoky", Kind("fog", SMOKE, rank=1, dyed=True)),
     ("sandy, dusty, grain", Kind("sandstorm", rank=1)),
-    ("ashy", Kind("snowfall", ASH, None, {"size": 0.8, "fall_speed": 0.5}, 1)),
-    ("particle, speck, glitter, sparkle, star", Kind("snowfall", factors={"fall_speed": 0.6}, rank=1)),
+    ("ashy", Kind("snowfall", ASH, None, {"size": 0.8, "fall_speed": 0.5}, 1, True)),
+    ("particle, speck, glitter, sparkle", Kind("snowfall", factors={"fall_speed": 0.6}, rank=1, dyed=True)),
+    ("star", Kind("snowfall", factors={"fall_speed": 0.6, "glow": 0.8, "twinkle": 2.0}, rank=1, dyed=True)),
     ("storm, tempest, squall", Kind("rainfall", rank=0)),
 )
 """Kinds by their names in the singular. Some of rank 1 and 0 are qualities too: a blizzard of petals, a sand storm."""
@@ -125,10 +134,11 @@ QUALITIES: dict[str, dict[str, float | bool]] = _spread(
     ("driving, driven, horizontal, sideways", {"wind": 3.0}),
     ("swirling, whirling, eddying", {"wind": 1.5, "tumbling": 2.0}),
     ("tumbling, fluttering, spinning, twirling, dancing, swaying, wobbling", {"tumbling": 2.5}),
-    ("glittering, glittery, glitter, sparkling, sparkly, sparkle, twinkling, glinting", {"glitter": 0.7}),
+    ("glittering, glittery, glitter, sparkling, sparkly, sparkle, glinting", {"glitter": 0.7}),
     ("shimmering, shiny, iridescent, glossy", {"glitter": 0.4}),
-    ("glowing, luminous, radiant, shining", {"glitter": 0.6, "opacity": 1.3}),
-    ("magic, magical, fairy, enchanted", {"glitter": 0.8, "fall_speed": 0.6}),
+    ("twinkling, blinking, pulsing, flickering", {"glow": 0.3, "twinkle": 1.5}),
+    ("glowing, luminous, radiant, shining", {"glow": 0.6}),
+    ("magic, magical, fairy, enchanted", {"glow": 0.6, "twinkle": 1.0, "fall_speed": 0.6}),
     ("transparent, translucent, glassy, ghostly, sheer, clear", {"opacity": 0.4}),
     ("opaque, solid", {"opacity": 1.6}),
     ("wet, sticky, slushy", {"size": 1.3, "fall_speed": 1.3, "accumulates": True}),
