@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numba
 import numpy as np
@@ -126,7 +127,7 @@ class StandingWater:
         filled, parent, order = flood(heights, drains)
         for _ in range(_ROUNDS):
             deep = known & (filled > heights + DEEPEST * 1.0001)
-            labels, count = ndimage.label(deep, np.ones((3, 3)))
+            labels, count = _patches(deep)
             if count == 0:
                 break
             lowest = np.array(ndimage.minimum_position(heights, labels, np.arange(1, count + 1)))
@@ -219,8 +220,8 @@ class StandingWater:
     @cached_property
     def _around(self) -> Int[ndarray, "x y"]:
         """The hollow of each cell or of the cell beside it, -1 for none."""
-        apart, nearest = ndimage.distance_transform_cdt(self.basin < 0, metric="chessboard", return_indices=True)
-        return np.where(apart <= 1, self.basin[tuple(nearest)], -1)
+        beside = ndimage.maximum_filter(self.basin, 3, mode="constant", cval=-1)
+        return np.where(self.basin >= 0, self.basin, beside)
 
     @cached_property
     def _known(self) -> Float[ndarray, "x y"]:
@@ -228,7 +229,7 @@ class StandingWater:
         unknown = ~np.isfinite(self.ground)
         if unknown.all():
             return np.zeros_like(self.ground)
-        return self.ground[tuple(ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True))]
+        return _filled_in(self.ground)
 
 
 def depth_over(pools: Pools, basin: Int[ndarray, " n"], floor: Float[ndarray, " n"]) -> Float[ndarray, " n"]:
@@ -248,7 +249,9 @@ def heights_below(surface: SurfaceMesh, at: Float[ndarray, "n 2"], start: Float[
         start: heights above them, m.
     """
     origins = np.concatenate([at, start[:, None]], 1).astype(np.float32)
-    hits = surface.cast(origins, np.broadcast_to(np.float32([0, 0, -1]), origins.shape).copy())
+    down = np.zeros_like(origins)
+    down[:, 2] = -1.0
+    hits = surface.cast(origins, down)
     distance, upward = hits.distance.numpy().astype(np.float64), hits.normal.numpy()[:, 2] > 0
     return np.where(np.isfinite(distance) & upward, start - distance, np.nan)
 
@@ -269,16 +272,27 @@ def _level(at: Float[ndarray, "n 2"], heights: Float[ndarray, " n"]) -> Float[nd
     return plane if math.hypot(*plane[1:]) < math.tan(math.radians(TILTED)) else np.zeros(3)
 
 
+def _patches(cells: Bool[ndarray, "x y"]) -> tuple[Int[ndarray, "x y"], int]:
+    """Number from 1 on of the connected patch of each cell, 0 outside, and how many there are."""
+    found: Any = ndimage.label(cells, np.ones((3, 3)))
+    return found
+
+
+def _filled_in(ground: Float[ndarray, "x y"]) -> Float[ndarray, "x y"]:
+    """Heights of which unknown ones are those of the nearest known cell."""
+    nearest: Any = ndimage.distance_transform_edt(~np.isfinite(ground), return_distances=False, return_indices=True)
+    return ground[tuple(nearest)]
+
+
 def _mended(ground: Float[ndarray, "x y"], cell: float) -> Float[ndarray, "x y"]:
     """Heights without the small holes and dents of a scanned mesh, through which no water leaves."""
     width, dent, hole = MENDED
     unknown = ~np.isfinite(ground)
     if unknown.all():
         return ground
-    labels, count = ndimage.label(unknown)
+    labels, count = _patches(unknown)
     small = np.append(False, np.bincount(labels.ravel(), minlength=count + 1)[1:] * cell**2 < hole)
-    nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    whole = ground[tuple(nearest)]
+    whole = _filled_in(ground)
     median = ndimage.median_filter(whole, size=2 * round(width / cell / 2) + 1, mode="nearest")
     flat = np.where(np.abs(whole - median) < dent, median, whole)
     return np.where(unknown & ~small[labels], np.nan, flat)
@@ -326,7 +340,7 @@ def _basins(
     """
     if not water.any():
         return np.full(water.shape, -1), 0
-    labels, _ = ndimage.label(water, np.ones((3, 3)))
+    labels, _ = _patches(water)
     # Neighbouring hollows of different level touch where one spills into the other.
     levels = np.unique(np.stack([labels[water], filled[water].view(np.int64)]), axis=1, return_inverse=True)
     separate = np.zeros(water.shape, int)
@@ -396,7 +410,7 @@ def flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray]
 
 
 @numba.njit(cache=True)
-def _push(heights: ndarray, cells: ndarray, size: int, height: float, cell: int) -> int:
+def _push(heights: ndarray, cells: ndarray, size: int, height: Any, cell: int) -> int:
     """Add to a binary heap; returns its size."""
     at = size
     while at > 0:
