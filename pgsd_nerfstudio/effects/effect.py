@@ -86,8 +86,6 @@ class Appearance:
 
     active: StateLook = field(default_factory=StateLook)
     collided: StateLook = field(default_factory=StateLook)
-    widest_pixels: float | None = None
-    """Greatest standard deviation in pixels of what flies, across its way: grains near the lens are no balls. None: no bound."""
     exposure: float = 0.0
     """Shutter time in seconds: active particles are smeared by speed times this. 0 freezes them, as is usual for snow; rain and
     sand show streaks at 1/50 s."""

@@ -18,7 +18,9 @@ QUARTZ = Material(mass_milligram=1.3875, mass_exponent=3.0, speed_law="sand")  #
 SANDSTORM = register(
     Effect(
         name="sandstorm",
-        emission=Emission(kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=1.0, most=40_000, share=0.1),
+        emission=Emission(
+            kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=2.5, most=40_000, share=0.1
+        ),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
         timeline=Timeline(onset=5.0, arrives="as a front"),
@@ -41,14 +43,13 @@ SANDSTORM = register(
                 scale_spread=0.5,
                 opacity=0.97,
                 opacity_spread=0.0,
-                rgb=(0.90, 0.75, 0.53),
-                tone_spread=0.14,
+                rgb=(0.98, 0.86, 0.66),
+                tone_spread=0.20,
             ),
             collided=StateLook(
                 scale_spread=0.4, opacity=0.35, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
             ),
-            legibility=600.0,
-            widest_pixels=1.0,
+            legibility=1000.0,
             exposure=1 / 50,
         ),
         haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.4, patch_size=16.0),
