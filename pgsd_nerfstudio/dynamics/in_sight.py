@@ -26,6 +26,7 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 
+LENS = 0.3  # m; nearer than this to the camera's centre nothing that flies is drawn
 SPARE = 1.0  # pixels around the picture: single precision moves a centre by less
 
 
@@ -87,13 +88,22 @@ class Extents(NamedTuple):
     collided: Float[np.ndarray, " p"]
 
     @staticmethod
-    def of(look: InitialLook) -> Extents:
-        """Of a look on the CPU; what spreads after it has landed ends with the larger size."""
-        return Extents(look.active.scales.amax(1).numpy(force=True), look.collided.scales.amax(1).numpy(force=True))
+    def of(look: InitialLook, widening: float = 1.0) -> Extents:
+        """Of a look on the CPU; what spreads after it has landed ends with the larger size.
+
+        Args:
+            look: of all particles.
+            widening: factor on the size of the active ones.
+        """
+        active, collided = (state.scales.amax(1).numpy(force=True) for state in (look.active, look.collided))
+        return Extents(widening * active, collided)
 
 
 def fading_in(positions: Float[Tensor, "n 3"], reaches: Float[Tensor, " n"], center: Float[Tensor, "3"]) -> Float[Tensor, " n"]:
     """Factor on the opacity of flying particles: 0 farther from the camera than their reach, 1 from 1 / (1 + FADE) of it on.
+
+    Right before the lens a particle is out of focus and spread over so much of the picture that it is not seen: between 2 LENS
+    and LENS it fades out.
 
     Args:
         positions: metres.
@@ -101,7 +111,7 @@ def fading_in(positions: Float[Tensor, "n 3"], reaches: Float[Tensor, " n"], cen
         center: position of the camera, metres.
     """
     distances = (positions - center).norm(dim=1).clamp_min(1e-6)
-    return ((reaches / distances - 1.0) / FADE).clamp(0.0, 1.0)
+    return ((reaches / distances - 1.0) / FADE).clamp(0.0, 1.0) * (distances / LENS - 1.0).clamp(0.0, 1.0)
 
 
 def faded_in(instant: RolloutFrame, reaches: Float[Tensor, " p"], eye: Eye) -> Gaussians:

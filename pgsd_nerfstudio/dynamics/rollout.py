@@ -23,6 +23,7 @@ from pgsd_nerfstudio.dynamics.in_sight import Extents, Eye, faded_in, in_sight
 from pgsd_nerfstudio.dynamics.look import LearnedLook, changed
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame, check_frame
 from pgsd_nerfstudio.dynamics.sequence import Begin, GaussianSequence, Progress
+from pgsd_nerfstudio.dynamics.sparkle import Sparkle, sparkling
 from pgsd_nerfstudio.dynamics.state import Deltas, RolloutState, advance, fading, simulated, simulated_of
 from pgsd_nerfstudio.dynamics.velocity_field import VelocityField
 from pgsd_nerfstudio.effects.appearance import InitialLook, ParticleLook
@@ -45,6 +46,7 @@ class Rollout(GaussianSequence):
         stride: int = 25,
         exposure: float = 0.0,
         motion: Motion = "particle",
+        sparkle: Sparkle | None = None,
     ) -> None:
         """Set up; nothing is rolled out yet.
 
@@ -57,6 +59,7 @@ class Rollout(GaussianSequence):
             exposure: seconds that the shutter is open. Active Gaussians carry how far the simulation moves them in that time.
             motion: a particle that has drifted follows the simulated motion of its own trajectory ("particle", the paper), or
                 that of the place where it is ("field", see VelocityField); both lead to the simulated contact.
+            sparkle: what active particles do with light over time, where a camera sees them; None: they shine evenly.
 
         Raises:
             ValueError: the stride is below one frame, or there is no such motion.
@@ -66,7 +69,7 @@ class Rollout(GaussianSequence):
         if motion not in ("particle", "field"):
             raise ValueError(f'motion must be "particle" or "field", got "{motion}"')
         super().__init__(history, look, learned_look)
-        self.field, self.stride, self.exposure, self.motion = field, stride, exposure, motion
+        self.field, self.stride, self.exposure, self.motion, self.sparkle = field, stride, exposure, motion, sparkle
         self._keyframes: dict[int, RolloutState] = {}
         self._stamp: tuple[int, ...] = ()
         self._last: RolloutState | None = None
@@ -182,14 +185,21 @@ class Rollout(GaussianSequence):
         else:
             chosen = in_sight(self.history, frame, self._extents(look), self.exposure, eye)
             found = self._rendered(simulated_of(self.history, frame, *chosen), look, None)
-        return found if eye is None else replace(found, gaussians=faded_in(found, self.history.reaches, eye))
+        if eye is None:
+            return found
+        seen = faded_in(found, self.history.reaches, eye)
+        if self.sparkle is not None:
+            center = torch.from_numpy(eye.center).to(seen.means)
+            seen = sparkling(seen, found.active, frame / self.history.fps, center, self.sparkle)
+        return replace(found, gaussians=seen)
 
     def _extents(self, look: InitialLook) -> Extents:
-        """Sizes of the particles; those of the initial look are kept."""
+        """Sizes of the particles with their halos; those of the initial look are kept."""
+        widening = 1.0 if self.sparkle is None else self.sparkle.widening
         if look is not self.look:
-            return Extents.of(look)
+            return Extents.of(look, widening)
         if self._initial_extents is None:
-            self._initial_extents = Extents.of(look)
+            self._initial_extents = Extents.of(look, widening)
         return self._initial_extents
 
     def _reach(self, frame: int, visible: Bool[Tensor, " p"] | None, look: InitialLook) -> RolloutState:

@@ -23,6 +23,7 @@ from torch.nn import Parameter
 
 from pgsd_nerfstudio.dynamics import Deformation, DeformedCloud, DynamicsField, LearnedLook, Rollout
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
+from pgsd_nerfstudio.dynamics.sparkle import Sparkle
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.plugin.environment import RunError
 from pgsd_nerfstudio.plugin.moments import Moments, place_in_path
@@ -107,7 +108,8 @@ class WeatherModel(SplatfactoModel):
             deformation = Deformation(box, history.frames).to(history.device)
             return deformation, DeformedCloud(history, look, deformation, self.look)
         dynamics = DynamicsField.for_history(history, config=options.dynamics)
-        how = {"stride": STRIDE, "exposure": self.made.effect.appearance.exposure, "motion": options.motion}
+        shown = self.made.effect.appearance
+        how = {"stride": STRIDE, "exposure": shown.exposure, "motion": options.motion, "sparkle": Sparkle.of(shown.active)}
         return dynamics, Rollout(history, look, dynamics, self.look, **how)
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.dynamics.in_sight import Eye
 from pgsd_nerfstudio.dynamics.sequence import GaussianSequence
+from pgsd_nerfstudio.dynamics.sparkle import Sparkle
 from pgsd_nerfstudio.effects import Effect, InitialLook, initial_look
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.physics.record.report import report
@@ -57,7 +58,8 @@ class Weather:
             return self.trained
         # A field that has learned nothing adds nothing.
         field = DynamicsField.for_history(self.history)
-        return Rollout(self.history, self.look, field, exposure=self.effect.appearance.exposure)
+        shown = self.effect.appearance
+        return Rollout(self.history, self.look, field, exposure=shown.exposure, sparkle=Sparkle.of(shown.active))
 
     def __repr__(self) -> str:
         what = f"{self.effect.name} in {self.scene.name}, {self.frame_count / self.fps:g} s"
