@@ -23,7 +23,7 @@ from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
-LEAST_LIGHT = np.float32(1 / 255)  # share of the light in a pixel below which nothing behind the scene is seen
+LEAST_LIGHT = np.float32(0.02)  # share of the light in a pixel below which what is behind the scene does not matter
 
 
 class CpuRasterizer:

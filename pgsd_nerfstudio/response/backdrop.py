@@ -19,7 +19,7 @@ from pgsd_nerfstudio.rendering.moment import Gaps, Viewpoint
 from pgsd_nerfstudio.response.airlight import thinned
 from pgsd_nerfstudio.response.sky import overcast, reach
 
-LEAST = 1 / 255  # share of the light in a gap below which nothing is seen through it
+LEAST = 0.05  # share of the light in a gap below which nothing is seen through it; a white sky would add a twentieth
 OPEN = (0.3, 0.9)  # share of the light between which a gap is more and more open sky
 
 

@@ -1,5 +1,5 @@
 """Figures of weather in pictures against laws: fog, snow on surfaces, the first second, the sun. `weather_ground` has those of
-motion and landings."""
+motion and landings, `weather_light` those of light and cover."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows import motion_costs as rows_motion_costs
 from pgsd_nerfstudio.laboratory.rows import weather_ground as rows_weather_ground
+from pgsd_nerfstudio.laboratory.rows import weather_light as rows_weather_light
 from pgsd_nerfstudio.laboratory.rows import weather_water as rows_weather_water
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
@@ -50,6 +51,7 @@ def verify(quick: bool) -> list[Record]:
         *_first_second(scene, surface),
         _sun(scene),
         *rows_weather_ground.rows(quick),
+        *rows_weather_light.rows(quick),
         *rows_weather_water.rows(quick),
     ]
 
