@@ -223,6 +223,7 @@ def test_collided_particles_take_the_light_of_their_place_and_lie_only_where_the
         collided=torch.tensor([True, True, False, True, True]),
         rest_positions=places,
         rest_quats=torch.tensor([flat, flat, flat, flat, wall]),
+        rest_covers=torch.zeros(5),
     )
     metric = FRAME.gaussians_to_metric(replace(floor(), colors=torch.zeros(n, 3)))
     found = in_place(InitialLook(look, look, 0.0), history, shaded, metric).collided

@@ -46,7 +46,8 @@ def in_place(look: InitialLook, history: ParticleHistory, answer: Answer, metric
     collided = history.collided.nonzero()[:, 0].cpu()
     if answer.effect.surface.landing != "stays" or len(known) == 0 or len(collided) == 0:
         return look
-    metric, at = metric.to("cpu"), history.rest_positions.cpu()[collided]
+    metric, at = metric.to("cpu"), history.rest_positions.cpu()[collided].clone()
+    at[:, 2] -= history.rest_covers.cpu()[collided]  # the place on the bare surface
     _, nearest = KDTree(metric.means[known].numpy()).query(at.numpy(), min(NEIGHBOURS, len(known)))
     nearest = known[torch.from_numpy(nearest).reshape(len(collided), -1)]
     sky, catches = (values.cpu()[nearest].mean(1) for values in (answer.exposure.sky, answer.exposure.catches))
