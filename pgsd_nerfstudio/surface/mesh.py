@@ -29,6 +29,7 @@ VERSION = 2  # of the fusion; cached meshes of another version are not read
 NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance from the cameras to what they look at
 NEAR = 1.25  # radius of the finely fused ball around what the cameras look at, in radii
 SKY = 1.25 * REACH  # distance from the nearest camera in radii beyond which a Gaussian is sky: nothing is fused there
+FEW = 20_000  # rays or points that one thread takes alone
 MAX_TRIANGLES = {"near": 330_000, "far": 70_000}
 
 Points = Float[Tensor | np.ndarray, "n 3"]
@@ -108,7 +109,7 @@ class SurfaceMesh:
             origins: where the rays start, in metres.
             directions: of any length; distances count in this length.
         """
-        found = self.raycasting.cast_rays(queries(origins, directions))
+        found = self.raycasting.cast_rays(queries(origins, directions), _threads(len(origins)))
         return RayHits(*(found[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")))
 
     def normals_of(self, found: RayHits, which: Int[np.ndarray, " h"]) -> Float[np.ndarray, "h 3"]:
@@ -131,7 +132,7 @@ class SurfaceMesh:
             up = torch.tensor([0.0, 0.0, 1.0]).repeat(len(points), 1)
             return Closest(points.clone(), up, torch.full((len(points),), torch.inf))
         query = queries(points)
-        found = self.raycasting.compute_closest_points(query)
+        found = self.raycasting.compute_closest_points(query, _threads(len(points)))
         nearest = torch.from_numpy(found["points"].numpy())
         distance = (nearest - torch.from_numpy(query.numpy())).norm(dim=1)
         own = found["primitive_normals"].numpy()
@@ -245,6 +246,11 @@ def _fuse_within(
         if len(triangles) <= budget:
             return vertices, triangles
         fusion = replace(fusion, voxel=fusion.voxel * 1.05 * (len(triangles) / budget) ** 0.5)
+
+
+def _threads(count: int) -> int:
+    """Threads for as many rays or points, 0 for all: to wake them costs as much as a few thousand rays."""
+    return 1 if count < FEW else 0
 
 
 def queries(*parts: Points) -> Any:

@@ -14,7 +14,7 @@ water is not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +62,8 @@ class Sizes:
     """Chance of a real particle of each diameter to be simulated, apart from its reach."""
     sharpness: float | None
     """Distance up to which all particles are kept, relative to their diameter; None: thinning does not depend on distance."""
+    _spectra: dict[float, Float[ndarray, " d"]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What `in_air` found, by distance: it is asked for the same few in every frame."""
 
     @staticmethod
     def of(effect: Effect, domain: Domain, max_particles: int, sight: Sight, sharpness: float | None = None) -> Sizes:
@@ -109,7 +111,9 @@ class Sizes:
 
     def in_air(self, distance: float = 0.0) -> Float[ndarray, " d"]:
         """Simulated particles per m^3 with at most each diameter, at a distance in metres from cameras."""
-        return cumulative(self.density * self._chance(self.diameters, distance), self.diameters)
+        if distance not in self._spectra:
+            self._spectra[distance] = cumulative(self.density * self._chance(self.diameters, distance), self.diameters)
+        return self._spectra[distance]
 
     def draw(self, count: int, distance: float, rng: np.random.Generator) -> tuple[Float[ndarray, " n"], Float[ndarray, " n"]]:
         """Random diameters and reaches in metres of `count` particles, one from each of as many equal parts of the spectrum.

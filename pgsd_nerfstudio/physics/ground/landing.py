@@ -8,9 +8,11 @@ and with a linearly falling chance in between. A particle that does not stay sli
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
+import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +20,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.clock import Domain
+from pgsd_nerfstudio.physics.curve import along_curve
 from pgsd_nerfstudio.surface.clearance import Clearance
 
 if TYPE_CHECKING:
@@ -109,6 +112,8 @@ class Ground:
         tried = self.clearance.near(start, stop, thickest)
         if len(tried) == 0 or len(self.surface.triangles) == 0:
             return Meeting(tried[:0], start[:0], start[:0])
+        # Rays of neighbours one after the other take a third of the time.
+        tried = tried[along_curve(start[tried], *self._box)]
         start = start[tried]
         path = stop[tried] - start
         length = np.sqrt((path * path).sum(1))
@@ -120,8 +125,14 @@ class Ground:
         normal = np.where((normal * direction).sum(1, keepdims=True) > 0, -normal, normal)
         if cover is not None and thickest > 0:
             distance, normal = _raised(cover, start, direction, distance, normal)
-        met = distance <= length
+        met = (distance <= length).nonzero()[0]
+        met = met[np.argsort(tried[hit[met]])]
         return Meeting(tried[hit[met]], start[met] + direction[met] * distance[met, None], normal[met])
+
+    @property
+    def _box(self) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+        """Corners of the map, m."""
+        return self.clearance.lower, self.clearance.lower + self.clearance.cell * np.array(self.clearance.parts.shape)
 
     def open_above(self, points: Float[ndarray, "n 3"], toward: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Whether the surface does not hide each point from the sky.
@@ -133,7 +144,10 @@ class Ground:
         if len(points) == 0 or len(self.surface.triangles) == 0:
             return np.ones(len(points), bool)
         direction = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-        return ~np.isfinite(self.surface.first_hits(points, direction).distance)
+        order = along_curve(points, *self._box)
+        found = np.empty(len(points), bool)
+        found[order] = np.isinf(self.surface.first_hits(points[order], direction[order]).distance)
+        return found
 
     def holds(self, normals: Float[ndarray, "h 3"], draw: Float[ndarray, " h"]) -> Bool[ndarray, " h"]:
         """Whether particles stay at their contacts; they never stay on a surface that faces down.
@@ -176,9 +190,7 @@ class Ground:
         Rays are cast along the normal onto rings around the point. The surface is unbroken where they hit it within ROUGH of
         the plane.
         """
-        first, second = _tangents(normal)
-        turns = 2 * np.pi * np.arange(PROBES) / PROBES
-        around = np.cos(turns)[:, None] * first[:, None] + np.sin(turns)[:, None] * second[:, None]  # [h, PROBES, 3]
+        axes = np.stack([normal, *_tangents(normal)], 1)
         extent = np.full(len(at), SMALLEST * self.response.probe, np.float32)
         unbroken, total = np.arange(len(at)), 2.0 * normal
         for share in PROBE_RINGS:
@@ -186,10 +198,7 @@ class Ground:
                 break
             radius = share * self.response.probe
             tolerance = ROUGH * radius + 0.01
-            above = at[unbroken] + 2 * tolerance * normal[unbroken]
-            origin = above[:, None] + radius * around[unbroken]
-            down = np.broadcast_to(-normal[unbroken, None], origin.shape)
-            found = self.surface.first_hits(origin.reshape(-1, 3), down.reshape(-1, 3))
+            found = self.surface.first_hits(*_ring(at, axes, unbroken, radius, 2 * tolerance))
             same = (np.abs(found.distance - 2 * tolerance) <= tolerance).reshape(-1, PROBES)
             normals = np.zeros((same.size, 3), np.float32)
             hit = same.ravel().nonzero()[0]
@@ -199,6 +208,24 @@ class Ground:
             extent[unbroken] = radius
         smooth = _upward(total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-6))
         return smooth, extent
+
+
+@numba.njit(cache=True, nogil=True)
+def _ring(at, axes, which, radius, height):
+    """Origins and directions of PROBES rays around some of the points, from `height` above their planes down onto a ring.
+
+    `axes` [h, 3, 3] has the normal of each plane and two tangents.
+    """
+    origins, directions = np.empty((PROBES * len(which), 3), np.float32), np.empty((PROBES * len(which), 3), np.float32)
+    for n in range(len(which)):
+        for probe in range(PROBES):
+            turn = 2 * np.pi * probe / PROBES
+            along, across = radius * math.cos(turn), radius * math.sin(turn)
+            for axis in range(3):
+                normal, first, second = axes[which[n], 0, axis], axes[which[n], 1, axis], axes[which[n], 2, axis]
+                origins[PROBES * n + probe, axis] = at[which[n], axis] + height * normal + along * first + across * second
+                directions[PROBES * n + probe, axis] = -normal
+    return origins, directions
 
 
 def _raised(

@@ -67,8 +67,9 @@ def slide(bodies: Bodies, surface: SurfaceMesh, friction: float, step: float) ->
 def _stopped(surface: SurfaceMesh, x: Float[ndarray, "n 3"], moved: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
     """Ends of the paths from `x` to `moved`: each stops before the first surface, so that no slider crosses one in a corner."""
     path = moved - x
-    hits = surface.cast(torch.from_numpy(x.astype(np.float32)), torch.from_numpy(path.astype(np.float32)))
-    share = (hits.distance.numpy().astype(np.float64) - SHORT).clip(0.0, 1.0)
+    if len(path) == 0 or len(surface.triangles) == 0:
+        return moved
+    share = (surface.first_hits(x, path).distance.astype(np.float64) - SHORT).clip(0.0, 1.0)
     return x + np.where(np.isfinite(share), share, 1.0)[:, None] * path
 
 

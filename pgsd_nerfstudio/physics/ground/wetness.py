@@ -129,7 +129,7 @@ class WetnessGrid:
         total = weights.sum(1)
         caught = total > 0
         share = weights[caught] / total[caught, None] * np.asarray(mass, np.float64)[caught, None]
-        np.add.at(self.water, cells[caught], share)
+        _add(self.water, cells[caught], share)
         self.deposited += float(share.sum())
         return float(np.asarray(mass, np.float64)[~caught].sum())
 
@@ -256,6 +256,13 @@ def _beside(keys, columns, shape):
                     found[c, n] = other
             n += 1
     return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(water, cells, share):
+    for n in range(len(cells)):
+        for corner in range(8):
+            water[cells[n, corner]] += share[n, corner]
 
 
 @numba.njit(cache=True, nogil=True)
