@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import torch
 
 from pgsd_nerfstudio.physics.bodies import RunState
 from pgsd_nerfstudio.physics.clock import Clock
-from pgsd_nerfstudio.physics.record.chunks import Chunk, assemble
+from pgsd_nerfstudio.physics.record.chunks import Chunk, _trajectories, assemble
+from pgsd_nerfstudio.physics.record.codec import quantised
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
@@ -210,3 +212,26 @@ def test_nan_is_reported_with_its_frame(history):
 def test_offsets_must_cover_the_positions(history):
     with pytest.raises(ValueError, match="offsets must have 4 entries and end at 6"):
         replace(history, positions=history.positions[:-1])
+
+
+def test_rows_are_placed_by_particle_and_frame_and_wrong_ones_are_refused():
+    """Two chunks of two frames each; particle 1 is born in frame 1, particle 0 ends before frame 3."""
+    births, offsets = np.array([0, 1], np.int32), np.array([0, 3, 6])
+    at = np.arange(18, dtype=np.float32).reshape(6, 3)
+    ids = [np.array([0, 1, 0], np.int32), np.array([1, 0, 1], np.int32)]
+    counts = [np.array([1, 2], np.int32), np.array([2, 1], np.int32)]
+
+    def placed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        rows = zip((0, 2), ids, counts, (first, second), strict=True)
+        chunks = [SimpleNamespace(start=s, row_ids=i, row_counts=c, row_positions=p) for s, i, c, p in rows]
+        return _trajectories(chunks, births, offsets)  # type: ignore[arg-type]
+
+    expected = at[[0, 2, 4, 1, 3, 5]]  # by particle, then frame
+    np.testing.assert_array_equal(placed(at[:3], at[3:]), expected)
+    far = at + np.float32(5000.0)  # the lattice is coarser there
+    np.testing.assert_array_equal(placed(far[:3], far[3:]), quantised(far[[0, 2, 4, 1, 3, 5]], offsets))
+    with pytest.raises(ValueError, match=r"particle 1 is not finite, or it is not active, in frame 2"):
+        placed(at[:3], np.where(np.arange(3)[:, None] == 0, np.float32(np.nan), at[3:]))
+    ids[1][2] = 0  # in frame 3
+    with pytest.raises(ValueError, match=r"particle 0 is not finite, or it is not active, in frame 3"):
+        placed(at[:3], at[3:])
