@@ -95,7 +95,7 @@ def test_cameras_see_all_flakes_nearby_and_fewer_far_away(most):
     found = fill(sizes, DOMAIN, sight, np.random.default_rng(0))
     distances = sight.distances(found.positions)
     seen = (sight._look_up(sight.seen_distances, found.positions) <= found.reaches).sum()
-    assert seen < 1.1 * most and len(found.positions) < 1.1 * CANDIDATES * most
+    assert seen < 1.1 * most and len(found.positions) < 1.1 * max(CANDIDATES, 10 * most)
     assert (found.reaches >= distances).all()
     volume, edges = sight.cell.prod(), (0.4, 1.2, 2.5, 4.0, 7.0)
     for low, high in itertools.pairwise(edges):

@@ -31,7 +31,7 @@ FOG = register(
                 tone_spread=0.02,
             )
         ),
-        haze=Haze(rgb=(0.80, 0.82, 0.84), patchiness=0.7, patch_size=8.0, scale_height=6.0),
+        haze=Haze(rgb=(0.80, 0.82, 0.84), patchiness=0.55, patch_size=8.0, scale_height=6.0),
         adaptation=Adaptation(visibility=2.5),
         ambience=Ambience(clouds=1.0, stops=-0.1, tint=(0.98, 1.0, 1.03), saturation=0.85, sky=(0.80, 0.82, 0.84)),
         prompt="Dense fog drifts through {scene}, soft patches of mist hide what is far away. Photorealistic, high detail",

@@ -52,7 +52,7 @@ SANDSTORM = register(
             legibility=1000.0,
             exposure=1 / 50,
         ),
-        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.4, patch_size=16.0),
+        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.3, patch_size=16.0),
         adaptation=Adaptation(visibility=2.0, wind_across=True),
         ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
         prompt="A sandstorm sweeps through {scene}, sand grains fly in the wind, dust hangs in the air and sand settles on "

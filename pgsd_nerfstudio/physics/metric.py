@@ -59,6 +59,7 @@ def simulate_metric(
     seed: int = 0,
     max_particles: int | None = None,
     cameras: Cameras | None = None,
+    sharpness: float | None = None,
     progress: bool = True,
     resume: Path | None = None,
 ) -> ParticleHistory:
@@ -72,6 +73,8 @@ def simulate_metric(
         seed: of all random numbers.
         max_particles: most particles that the cameras see at once, or that are in the air without cameras. None: MAX_PARTICLES.
         cameras: in metres. Particles that cannot come into the view of any of them are left out. None: all are simulated.
+        sharpness: distance up to which the cameras tell all particles of rain and snow apart, relative to their diameter; None:
+            what their pictures show.
         progress: show a bar.
         resume: folder that keeps chunks until the run is complete. None keeps nothing.
 
@@ -93,7 +96,7 @@ def simulate_metric(
         sight, most = _sight(effect, domain, cameras), min(max_particles, effect.emission.most or max_particles)
         air = Air(
             domain=domain,
-            sizes=Sizes.of(effect, domain, most, sight, _sharpness(effect, cameras)),
+            sizes=Sizes.of(effect, domain, most, sight, sharpness or _sharpness(effect, cameras)),
             wind=WindField.draw(effect.wind, seed, Deflection.of(surface, domain, effect.wind)),
             arrival=Arrival.of(effect.timeline, domain, effect.wind),
             effect=effect,

@@ -28,7 +28,7 @@ def adapted(effect: Effect, prepared: PreparedScene) -> tuple[Effect, list[str]]
         prepared: the scene.
     """
     asked, said = effect.adaptation, []
-    shown = prepared.scene.cameras[list(choose_views(prepared.scene.cameras, prepared.scene.frame))]
+    shown = prepared.scene.cameras[torch.tensor(choose_views(prepared.scene.cameras, prepared.scene.frame))]
     if asked.wind_across:
         effect = replace(effect, wind=replace(effect.wind, direction_degrees=_across(prepared, shown)))
     if asked.visibility is not None and not effect.emission.precipitates:

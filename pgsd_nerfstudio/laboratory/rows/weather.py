@@ -1,5 +1,5 @@
 """Figures of weather in pictures against laws: fog, snow on surfaces, the first second, the sun. `weather_ground` has those of
-motion and landings, `weather_light` those of light and cover."""
+motion and landings, `weather_air` of what flies, `weather_light` those of light and cover."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pgsd_nerfstudio.effects.effect import EFFECTS, effect
 from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.rows import motion_costs as rows_motion_costs
+from pgsd_nerfstudio.laboratory.rows import weather_air as rows_weather_air
 from pgsd_nerfstudio.laboratory.rows import weather_ground as rows_weather_ground
 from pgsd_nerfstudio.laboratory.rows import weather_light as rows_weather_light
 from pgsd_nerfstudio.laboratory.rows import weather_water as rows_weather_water
@@ -50,6 +51,7 @@ def verify(quick: bool) -> list[Record]:
         *_layers(scene, surface),
         *_first_second(scene, surface),
         _sun(scene),
+        *rows_weather_air.rows(quick),
         *rows_weather_ground.rows(quick),
         *rows_weather_light.rows(quick),
         *rows_weather_water.rows(quick),

@@ -28,7 +28,7 @@ from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.populations import cumulative, integral, number_density
 
-CANDIDATES = 5  # particles that may come into view, to one that is in view: at most so many are led along their way
+CANDIDATES = 2_000_000  # particles that may come into view; at most so many, or ten to one that is in view, are led along
 
 
 class Newcomers(NamedTuple):
@@ -90,7 +90,10 @@ class Sizes:
 
             factor = _largest(evenly, float(1.0 / weight.min()), max_particles)
             return Sizes(diameter, density, np.minimum(1.0, factor * weight), None)
-        for distances, most in ((sight.seen_distances, max_particles), (sight.needed_distances, CANDIDATES * max_particles)):
+        for distances, most in (
+            (sight.seen_distances, max_particles),
+            (sight.needed_distances, max(CANDIDATES, 10 * max_particles)),
+        ):
             levels = distances[np.isfinite(distances)].clip(CLOSEST)
             if levels.size:
                 cells, edges = np.histogram(levels, np.geomspace(0.9 * CLOSEST, max(float(levels.max()), 1.0) * 1.01, 64))
