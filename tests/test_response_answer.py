@@ -235,6 +235,20 @@ def test_collided_particles_take_the_light_of_their_place_and_lie_only_where_the
 
 
 @pytest.mark.mistyped
+def test_ash_is_darker_than_snow_under_the_same_sky():
+    none = SimpleNamespace(collided=torch.zeros(4, dtype=torch.bool), rest_positions=torch.zeros(4, 3))
+    metric = FRAME.gaussians_to_metric(replace(floor(), colors=torch.zeros(GRID**2, 3)))
+
+    def shown(rgb: tuple[float, float, float]) -> torch.Tensor:
+        look = ParticleLook(torch.ones(4), torch.ones(4, 3), torch.tensor(rgb).expand(4, 3))
+        return linear(in_place(InitialLook(look, look, 0.0), none, answer(effect("snowfall")), metric).active.rgb)[0]
+
+    snow, grey = (0.95, 0.97, 1.0), (0.42, 0.41, 0.40)
+    share = linear(torch.tensor(grey)) / linear(torch.tensor(snow))
+    assert (shown(grey) / shown(snow) / share).tolist() == pytest.approx([1.0] * 3, abs=0.3)  # 5 times as dark
+
+
+@pytest.mark.mistyped
 def test_the_layer_hides_flakes_that_landed_before_it_and_soon_after_contact_those_that_land_on_it():
     look = ParticleLook(torch.ones(3), torch.ones(3, 3), torch.full((3, 3), 0.9))
     whole = InitialLook(look, look, 0.0, torch.tensor([2.0, 2.0, math.inf]))

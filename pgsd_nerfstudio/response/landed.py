@@ -29,6 +29,7 @@ NEIGHBOURS = 8  # frozen Gaussians whose share of the sky is averaged, since it 
 TOO_STEEP = 10.0  # degrees above the slope that holds all particles over which they are shown less and less
 SHELTERED = 0.15, 0.35  # mass that a place catches, relative to the open, between which particles are shown more and more
 WITHIN = 2.0  # distances between pieces of the layer within which it hides a particle
+SNOW = 0.8  # linear light of flakes that count as white, relative to white
 AGAINST_SKY = 0.97  # light of a white flake relative to that of an overcast sky behind it
 
 
@@ -71,7 +72,7 @@ def _under_clouds(look: InitialLook, answer: Answer) -> InitialLook:
     if ambience is None or answer.effect.emission.kind != "snowflakes":
         return look
     own = linear(look.active.rgb)
-    white = own.amax(1, keepdim=True).median().clamp_min(1e-6)
+    white = own.amax(1, keepdim=True).median().clamp_min(SNOW)  # ash and leaves are darker than snow and stay so
     light = AGAINST_SKY * linear(torch.tensor(answer.effect.haze.rgb if answer.effect.haze else ambience.sky).to(own))
     return replace(look, active=replace(look.active, rgb=encoded(own / white * light).clamp_max(1.0)))
 
