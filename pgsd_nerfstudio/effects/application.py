@@ -30,7 +30,8 @@ def applied(request: Request, *, base: Effect | None = None) -> Effect:
     """The effect that follows a request. A field at its default changes nothing; the others act as follows.
 
     - `rgb`: tints the active particles, and the collided ones if `landed_rgb` is None, as far as their matter takes a colour
-      (tint.py); if `dyed`, it is their colour. Haze and sky go the same way by HAZE_SHARE, for fog and sand by MATTER_SHARE.
+      (tint.py); if `dyed`, it is their colour. Haze and sky of fog and sand go the same way by MATTER_SHARE, those of
+      tinted snow and rain by HAZE_SHARE.
     - `landed_rgb`: the same for the collided particles alone.
     - `size`: see the docstring of the module.
     - `amount`: precipitation is multiplied by it, visibility is divided by it, within INTENSITIES. The parcels of fog stand for
@@ -189,7 +190,8 @@ def _ambience(request: Request, base: Effect) -> Ambience | None:
 
 
 def _hazy(own: Rgb, request: Request, base: Effect) -> Rgb:
-    if request.rgb is None:
+    # Petals, confetti and magic are few: the air between them is plain.
+    if request.rgb is None or (request.dyed and base.emission.precipitates):
         return own
     share = HAZE_SHARE if base.emission.precipitates else MATTER_SHARE
     return mixed_evenly(own, _coloured(own, request.rgb, request, base), share)

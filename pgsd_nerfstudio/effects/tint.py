@@ -46,7 +46,7 @@ class Matter:
 
 
 MATTER: dict[Kind, Matter] = {
-    "snowflakes": Matter(lightness=0.75, chroma=0.13),
+    "snowflakes": Matter(lightness=0.78, chroma=0.10),
     "raindrops": Matter(lightness=0.75, chroma=0.10),
     "fog droplets": Matter(lightness=0.85, chroma=0.08),
     # Iron oxides colour sand from ochre to rust; green and purple sands (olivine, garnet) have no more chroma than these.
