@@ -21,7 +21,21 @@ ROOMS = [
     *("scene", "rendering", "surface", "effects", "physics", "response", "dynamics", "guidance", "weather"),
     *("plugin", "laboratory", "cli"),
 ]
-PHYSICS = ["clock", "bodies", "laws", "mpm", "ground", "air", "record", "paper", "frames", "metric", "motion_prior"]
+PHYSICS = [
+    "clock",
+    "curve",
+    "bodies",
+    "flock",
+    "laws",
+    "mpm",
+    "ground",
+    "air",
+    "record",
+    "paper",
+    "frames",
+    "metric",
+    "motion_prior",
+]
 NERFSTUDIO = {"ns-train", "ns-viewer", "ns-render", "ns-eval", "ns-export"}
 
 
