@@ -25,7 +25,7 @@ from pgsd_nerfstudio.effects import EFFECTS, FOG, RAINFALL, SANDSTORM, SNOWFALL,
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.application import applied
 from pgsd_nerfstudio.effects.haze import Haze
-from pgsd_nerfstudio.effects.options import EffectOptions, colour_of
+from pgsd_nerfstudio.effects.options import EffectOptions, colour_of, legible
 from pgsd_nerfstudio.effects.reader import read
 from pgsd_nerfstudio.effects.tint import in_matter, mixed_evenly
 from pgsd_nerfstudio.physics.air.wind import WindField
@@ -61,7 +61,7 @@ def changed(effect: Effect, base: Effect) -> set[str]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_knobs_that_nobody_turned_give_the_effect_itself(name):
-    assert EffectOptions(effect=name).resolve() == (EFFECTS[name], [])
+    assert EffectOptions(effect=name).resolve() == (EFFECTS[name], legible(EFFECTS[name]))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -136,6 +136,12 @@ def test_a_colour_by_name_is_that_colour_in_hexadecimal(name, text):
     assert mixed is not None and mixed.rgb == pytest.approx(mixed_evenly(hazy.rgb, tinted, 0.35))
 
 
+def test_a_colour_for_what_is_no_weather_is_its_own():
+    red = EffectOptions(weather="confetti", color="red").resolve()[0]
+    assert red.appearance == EffectOptions(weather="red confetti").resolve()[0].appearance
+    assert red.appearance.active.rgb == (1.0, 0.0, 0.0)
+
+
 def test_short_hexadecimal_is_written_out_and_names_of_the_survey_are_known():
     assert colour_of("color", "#84c") == colour_of("color", "#8844cc") == pytest.approx((136 / 255, 68 / 255, 204 / 255))
     assert colour_of("color", "  dusty   rose ") == pytest.approx((192 / 255, 115 / 255, 122 / 255))  # XKCD: #c0737a
@@ -185,7 +191,7 @@ def test_words_for_what_vanishes_raise_no_cover_even_if_they_do_not_stay():
 
 def test_the_time_lapse_of_a_cover_can_be_set_where_there_is_one():
     assert turned("sandstorm", accumulation_speedup=7.0).surface == replace(SANDSTORM.surface, accumulation_speedup=7.0)
-    assert said(effect="sandstorm", accumulation_speedup=7.0) == ""
+    assert said(effect="sandstorm", accumulation_speedup=7.0, legibility=1.0) == ""
     assert turned("rainfall", accumulation_speedup=7.0).surface == replace(RAINFALL.surface, accumulation_speedup=7.0)
     for knobs in ({"effect": "rainfall", "puddles": False}, {"accumulation": False}):
         assert "--accumulation-speedup 7 changes nothing" in said(accumulation_speedup=7.0, **knobs)
@@ -296,6 +302,7 @@ FLAGS = (
     "--wind", "3", "--wind-direction", "-45", "--color", "#204060", "--haze-color", "lavender", "--haze", "0.5", "--onset", "1",
     "--ends", "9", "--visibility", "koschmieder", "--accumulation", "False", "--ambience", "False",
     "--accumulation-speedup", "20", "--puddles", "False", "--ripples", "False", "--mirror", "False", "--drips", "False",
+    "--legibility", "4",
 )  # fmt: skip
 
 

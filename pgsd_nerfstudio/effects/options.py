@@ -72,6 +72,7 @@ class EffectOptions:
     By default the effect's own, which for sand is across the view."""
     color: str | None = None
     """Colour of what flies and of what has landed, and a third of the haze's: #8040c0, purple, "dusty rose".
+    It tints matter: purple snow is nearly as bright as snow, yellow sand is ochre. Petals and confetti have it exactly.
     By default what effect or words say."""
     haze: float = 1.0
     """Factor on the opacity of the air between the particles, 0-20; 0 is clear air."""
@@ -130,7 +131,7 @@ class EffectOptions:
         self.check()
         effect, said = self._base(understanding)
         # Words and options are applied one after the other: their factors multiply.
-        effect, lacks = self._factors(effect)
+        effect, lacks = self._factors(effect, dyed=understanding is not None and understanding.request.dyed)
         said += [*lacks, *self._lacks(effect)]
         effect = replace(
             effect,
@@ -190,8 +191,8 @@ class EffectOptions:
             effect = replace(effect, appearance=replace(effect.appearance, exposure=self.exposure))
         return effect, said
 
-    def _factors(self, effect: Effect) -> tuple[Effect, tuple[str, ...]]:
-        """The options that a request has too; only what the video model is told stays."""
+    def _factors(self, effect: Effect, *, dyed: bool) -> tuple[Effect, tuple[str, ...]]:
+        """The options that a request has too; only what the video model is told stays. `dyed`: as in a request."""
         from pgsd_nerfstudio.effects.application import applied, remarks
         from pgsd_nerfstudio.effects.request import Request
 
@@ -200,6 +201,7 @@ class EffectOptions:
         request = Request(
             base=None,
             rgb=rgb,
+            dyed=dyed,
             amount=float(self.amount),
             size=float(self.size),
             accumulates=accumulates,

@@ -221,7 +221,7 @@ def _request(findings: Findings, kind: Kind, wanted: str) -> Request:
         base=kind.base,
         rgb=rgb,
         landed_rgb=kind.landed_rgb or rgb,
-        dyed=dyed and rgb is not None,
+        dyed=dyed,
         prompt=_sentence(wanted, kind.base, values.get("accumulates")),
         **values,  # pyright: ignore[reportArgumentType]
     )

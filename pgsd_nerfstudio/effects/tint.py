@@ -50,7 +50,7 @@ MATTER: dict[Kind, Matter] = {
     "raindrops": Matter(lightness=0.75, chroma=0.10),
     "fog droplets": Matter(lightness=0.85, chroma=0.08),
     # Iron oxides colour sand from ochre to rust; green and purple sands (olivine, garnet) have no more chroma than these.
-    "sand grains": Matter(lightness=0.85, chroma=0.13, hue=0.75),
+    "sand grains": Matter(lightness=0.85, chroma=0.11, hue=0.75),
 }
 """Estimates, but for sand: the ochres and khakis of the XKCD survey have chroma 0.05-0.15 and hues of 70-107 degrees."""
 

@@ -57,7 +57,11 @@ KINDS: dict[str, Kind] = _spread(
     ("sand, sandstorm, dust storm, duststorm, haboob", Kind("sandstorm")),
     ("dust", Kind("sandstorm", factors={"size": 0.5, "amount": 0.5, "wind": 0.4})),
     ("ash, ashes, ashfall, soot, cinder", _particle(ASH, size=0.8, fall_speed=0.5)),
-    ("ember, spark", _particle((1.0, 0.5, 0.12), SOOT, size=0.4, amount=0.5, fall_speed=0.3, glow=1.0, twinkle=2.0)),
+    # Embers are smaller than that, but so bright that a lens spreads their light.
+    (
+        "ember, spark",
+        _particle((1.0, 0.45, 0.1), SOOT, amount=0.5, fall_speed=0.3, tumbling=1.5, glow=1.0, twinkle=2.0, accumulates=False),
+    ),
     (
         "petal, blossom, cherry blossom, cherry petal, rose petal",
         _particle((0.98, 0.74, 0.82), size=2.0, amount=0.4, fall_speed=0.8, tumbling=3.0),
