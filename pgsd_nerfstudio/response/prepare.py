@@ -34,10 +34,11 @@ from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_t
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
-NEIGHBOURS = 16  # Gaussians over which the softening of shadows is averaged
+NEIGHBOURS = 64  # Gaussians over which the softening of shadows is averaged, as wide as shadows of the mesh are off
 MOST_SOFTENING = 5.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
+SUNNY = 1.2  # factor below which the sun shone on a Gaussian
 FLATNESS, STEEPEST_EDGE = 0.1, 1.5  # variance of log luminance that counts as flat; change of log factor per log luminance
-_REVISION = 6  # of the computation; stored answers of another revision are not used
+_REVISION = 7  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -239,7 +240,11 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
     _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
     around = torch.from_numpy(around).reshape(len(factor), -1)
-    return _along_edges(factor.log(), luminance(linear(metric.colors)).clamp_min(1e-3).log(), around).exp()
+    light = luminance(linear(metric.colors)).clamp_min(1e-3)
+    found = _along_edges(factor.log(), light.log(), around).exp()
+    # Beside a shadow nothing gets brighter than what the sun shone on there.
+    sunny = torch.where(found[around] < SUNNY, (light * found)[around], 0.0).amax(1)
+    return torch.where((sunny > 0) & (found > SUNNY), torch.minimum(found, (sunny / light).clamp_min(1.0)), found)
 
 
 def _along_edges(values: Float[Tensor, " n"], guide: Float[Tensor, " n"], around: Int[Tensor, "n k"]) -> Float[Tensor, " n"]:
