@@ -18,7 +18,20 @@ from scipy.special import i0
 
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
 from pgsd_nerfstudio.dynamics.in_sight import Eye
-from pgsd_nerfstudio.dynamics.sparkle import FAINTER, GAIN, GATHERED, LOBE, PULSE, SUN, TURNS, WIDER, Sparkle, _even, _mirrored
+from pgsd_nerfstudio.dynamics.sparkle import (
+    FAINTER,
+    GAIN,
+    GATHERED,
+    HOT,
+    LOBE,
+    PULSE,
+    SUN,
+    TURNS,
+    WIDER,
+    Sparkle,
+    _even,
+    _mirrored,
+)
 from pgsd_nerfstudio.effects.effect import StateLook
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.display import encoded, linear
@@ -147,7 +160,9 @@ def test_active_particles_glow_and_have_a_halo_and_landed_ones_do_not(plain, eye
     flying, resting = len(plain.history.active(20)), len(plain.history.resting(20))
     assert len(lit) == 2 * flying + resting == len(before) + flying and flying > 100 < resting
     body, halo = (lit.select(torch.arange(start, start + flying)) for start in (0, flying + resting))
-    torch.testing.assert_close(body.colors, encoded(linear(before.colors[:flying]) * (1 + 0.5 * GAIN)))
+    own = linear(before.colors[:flying])
+    torch.testing.assert_close(body.colors, encoded((own + 0.5 * HOT * (1 - own)) * (1 + 0.5 * GAIN)))
+    torch.testing.assert_close(halo.colors, encoded(own * (1 + 0.5 * GAIN)))
     assert torch.equal(lit.colors[flying : flying + resting], before.colors[flying:])
     assert torch.equal(halo.scales, WIDER * body.scales) and torch.equal(halo.opacities, 0.5 * FAINTER * body.opacities)
     assert torch.equal(halo.means, body.means) and torch.equal(body.opacities, before.opacities[:flying])

@@ -86,8 +86,8 @@ def _ratio(new: Any, old: Any) -> Any:
 
 
 def purple(base: Effect) -> dict[str, Any]:
-    """What purple dye changes: air and sky go 80 % of the way where they are matter, and stay plain where things fall."""
-    share = 0.0 if base.emission.precipitates else 0.8
+    """What purple dye changes: air and sky go 60 % of the way where they are matter, and stay plain where things fall."""
+    share = 0.0 if base.emission.precipitates else 0.6
     owns = {"haze.rgb": base.haze.rgb, "ambience.sky": base.ambience.sky} if base.haze and base.ambience else {}
     air = {
         name: tuple(round(new / old, 9) for old, new in zip(own, mixed_evenly(own, PURPLE, share), strict=True))

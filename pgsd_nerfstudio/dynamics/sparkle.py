@@ -9,7 +9,8 @@ to the camera, so that any frame can be made alone and all cameras agree.
   the mean of the lobe is 1 / (e + 1): glitter gathers light into flashes and adds none to the mean over particles, at any time
   and for any camera.
 - Twinkle. A pulse has the shape exp(k cos) / I0(k), the density of von Mises (1918): its mean over time is 1.
-- Glow. The factor 1 + GAIN glow, and a faint halo around the particle.
+- Glow. The factor 1 + GAIN glow, a core that is whiter than the rest, since what is far brighter than a picture can show takes
+  up all of its channels, and a faint halo around the particle in the particle's colour.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import StateLook
-from pgsd_nerfstudio.rendering.display import GAMMA
+from pgsd_nerfstudio.rendering.display import GAMMA, encoded, linear
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
 
 SUN = (0.36, 0.22, 0.907)  # direction to the brightest part of the sky: a glint needs one, and even a clouded sky has it above
@@ -31,6 +32,7 @@ GATHERED = 0.5  # part of a particle's light that goes into flashes at full glit
 TURNS = 0.6  # turns per second, give or take a half: a flash lasts a tenth of a second
 PULSE = 2.0  # k; between pulses 0.06 of the mean is left, at their height there is 3.2 of it
 GAIN = 6.0  # times the light of a white particle that one adds at a glow of 1
+HOT = 0.15  # part of the way to white of the core, at a glow of 1
 WIDER, FAINTER = 5.0, 0.05  # a halo has WIDER times the size and, at a glow of 1, FAINTER times the opacity
 
 _STEPS = tuple(0.5 ** (k / 7) for k in range(1, 7))
@@ -93,14 +95,15 @@ def sparkling(
     """
     n = len(ids)
     to_camera = torch.nn.functional.normalize(center - gaussians.means[:n], dim=1)
-    factor = sparkle.brightness(ids, second, to_camera) ** (1 / GAMMA)  # of light, on display values
-    colors = torch.cat([gaussians.colors[:n] * factor[:, None], gaussians.colors[n:]])
-    lit = replace(gaussians, colors=colors)
+    own = gaussians.colors[:n]
+    factor = sparkle.brightness(ids, second, to_camera)[:, None] ** (1 / GAMMA)  # of light, on display values
+    core = encoded(torch.lerp(linear(own), torch.ones_like(own), HOT * sparkle.glow)) if sparkle.glow else own
+    lit = replace(gaussians, colors=torch.cat([core * factor, gaussians.colors[n:]]))
     if n == 0 or sparkle.widening == 1.0:
         return lit
     halos = lit.select(torch.arange(n, device=ids.device))
-    halos = replace(halos, scales=halos.scales * WIDER, opacities=halos.opacities * (FAINTER * sparkle.glow))
-    return concatenate([lit, halos])
+    faint = halos.opacities * (FAINTER * sparkle.glow)
+    return concatenate([lit, replace(halos, scales=halos.scales * WIDER, opacities=faint, colors=own * factor)])
 
 
 def _mirrored(ids: Int[Tensor, " n"], second: float, to_camera: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

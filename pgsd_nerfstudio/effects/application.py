@@ -21,9 +21,9 @@ from pgsd_nerfstudio.effects.request import Request, Rgb
 from pgsd_nerfstudio.effects.surface_response import SurfaceResponse
 from pgsd_nerfstudio.effects.tint import in_matter, mixed_evenly
 
-HAZE_SHARE, MATTER_SHARE = 0.35, 0.8
+HAZE_SHARE, MATTER_SHARE = 0.35, 0.6
 """Part of the way from the base's haze colour to the same one dyed or tinted as the particles are. Between flakes and drops the
-haze is mostly plain air; fog and dust are the haze themselves."""
+haze is mostly plain air; fog and dust are the haze themselves, but even black smoke scatters some light."""
 
 
 def applied(request: Request, *, base: Effect | None = None) -> Effect:

@@ -92,8 +92,19 @@ KINDS: dict[str, Kind] = _spread(
     ("smoky", Kind("fog", SMOKE, rank=1, dyed=True)),
     ("sandy, dusty, grain", Kind("sandstorm", rank=1)),
     ("ashy", Kind("snowfall", ASH, None, {"size": 0.8, "fall_speed": 0.5}, 1, True)),
-    ("particle, speck, glitter, sparkle", Kind("snowfall", factors={"fall_speed": 0.6}, rank=1, dyed=True)),
-    ("star", Kind("snowfall", factors={"fall_speed": 0.6, "glow": 0.8, "twinkle": 2.0}, rank=1, dyed=True)),
+    (
+        "particle, speck, glitter, sparkle",
+        Kind("snowfall", factors={"fall_speed": 0.6, "accumulates": False}, rank=1, dyed=True),
+    ),
+    (
+        "star",
+        Kind(
+            "snowfall",
+            factors={"amount": 0.4, "fall_speed": 0.6, "glow": 0.8, "twinkle": 2.0, "accumulates": False},
+            rank=1,
+            dyed=True,
+        ),
+    ),
     ("storm, tempest, squall", Kind("rainfall", rank=0)),
 )
 """Kinds by their names in the singular. Some of rank 1 and 0 are qualities too: a blizzard of petals, a sand storm."""
