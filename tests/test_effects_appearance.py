@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 import math
 from dataclasses import dataclass, replace
 
@@ -135,3 +136,15 @@ def test_a_given_size_is_used_as_given():
     state = StateLook(scale_m=(0.03, 0.02, 0.004), scale_spread=0.0)
     effect = replace(SNOWFALL, appearance=replace(SNOWFALL.appearance, active=state))
     torch.testing.assert_close(initial_look(effect, Landed()).active.scales[0], torch.tensor([0.03, 0.02, 0.004]))
+
+
+def test_colourful_particles_have_all_hues_alike_and_the_others_keep_their_bits(look):
+    active, collided = (replace(state, colourful=True) for state in (SNOWFALL.appearance.active, SNOWFALL.appearance.collided))
+    motley = initial_look(
+        replace(SNOWFALL, appearance=replace(SNOWFALL.appearance, active=active, collided=collided)), Landed()
+    )
+    for found, plain in ((motley.active, look.active), (motley.collided, look.collided)):
+        assert torch.equal(found.opacity, plain.opacity) and torch.equal(found.scales, plain.scales)
+        hues = [colorsys.rgb_to_hsv(*rgb)[0] for rgb in (found.rgb / plain.rgb).tolist()]
+        counts, _ = np.histogram(hues, bins=12, range=(0, 1))
+        assert abs(counts - 2000 / 12).max() < 4

@@ -116,6 +116,9 @@ def test_a_request_is_plain_frozen_and_cannot_leave_its_limits():
     [
         ("purple snow", "snowfall", "purple", {}),
         ("glittering yellow sand", "sandstorm", "yellow", {"glitter": 0.7, "glow": 0.0, "twinkle": 0.0, "dyed": False}),
+        ("rainbow snow", "snowfall", None, {"colourful": True, "dyed": False}),
+        ("red confetti", "snowfall", "red", {"colourful": False, "dyed": True}),
+        ("confetti", "snowfall", None, {"colourful": True}),
         ("glowing, blinking red confetti", "snowfall", "red", {"glitter": 0.0, "glow": 0.6, "twinkle": 1.5, "dyed": True}),
         ("light snow", "snowfall", None, {"amount": 0.4}),
         ("light blue snow", "snowfall", "lightblue", {}),

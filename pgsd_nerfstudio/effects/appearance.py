@@ -19,6 +19,7 @@ from torch import Tensor
 from pgsd_nerfstudio.effects.effect import Effect, StateLook
 from pgsd_nerfstudio.effects.matter import Array
 
+VIVID = 0.85  # saturation (HSV) of particles of all hues
 BURIAL = 0.3  # s in which a layer hides a collided particle
 WIDEST = 0.02  # m; standard deviation of a collided particle along the surface, at most
 
@@ -199,4 +200,13 @@ def _look(state: StateLook, base: Float[Tensor, "p 3"], generator: torch.Generat
     tone = (1 - state.tone_spread * normal[:, 3].abs()).clamp(0.80, 1.0)
     tint = 1 + 0.012 * normal[:, 4:5] * torch.tensor([-1.0, 0.0, 1.0])  # slightly bluish or warm
     rgb = (torch.tensor(state.rgb) * tone[:, None] * tint).clamp(0.0, 1.0)
+    if state.colourful:
+        rgb = rgb * all_hues(len(rgb))
     return ParticleLook(opacity, base * torch.exp(log), rgb)
+
+
+def all_hues(count: int) -> Float[Tensor, "p 3"]:
+    """Vivid sRGB colours, one for each of `count` particles: their hues follow each other by the golden ratio."""
+    turns = torch.arange(count, dtype=torch.float64)[:, None] * ((5**0.5 - 1) / 2) + torch.tensor([0.0, 2 / 3, 1 / 3])
+    full = (6.0 * (torch.remainder(turns, 1.0) - 0.5).abs() - 1.0).clamp(0.0, 1.0)
+    return (1.0 - VIVID + VIVID * full).float()

@@ -33,6 +33,7 @@ def applied(request: Request, *, base: Effect | None = None) -> Effect:
       (tint.py); if `dyed`, it is their colour. Haze and sky of fog and sand go the same way by MATTER_SHARE, those of
       tinted snow and rain by HAZE_SHARE.
     - `landed_rgb`: the same for the collided particles alone.
+    - `colourful`: each particle has a hue of its own; a layer of cover has the common colour.
     - `size`: see the docstring of the module.
     - `amount`: precipitation is multiplied by it, visibility is divided by it, within INTENSITIES. The parcels of fog stand for
       droplets of a given extinction: if they are smaller or hold more, there are more of them, so that none needs an opacity
@@ -211,7 +212,7 @@ def _look(request: Request, state: StateLook) -> StateLook:
     """The changes that active and collided particles share."""
     opacity = None if state.opacity is None else min(state.opacity * request.opacity, 1.0)
     scale_m = None if state.scale_m is None else _times(state.scale_m, request.size)
-    return replace(state, opacity=opacity, scale_m=scale_m)
+    return replace(state, opacity=opacity, scale_m=scale_m, colourful=state.colourful or request.colourful)
 
 
 def _times(axes: tuple[float, float, float], factor: float) -> tuple[float, float, float]:

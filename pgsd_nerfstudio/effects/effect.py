@@ -69,6 +69,8 @@ class StateLook:
     """Colour, sRGB."""
     tone_spread: float = 0.04
     """Spread of the brightness from particle to particle; the brightness stays within 0.80-1."""
+    colourful: bool = False
+    """Whether each particle has a hue of its own, all hues alike often."""
     glitter: float = 0.0
     """Part of the light, 0-1, that tumbling facets mirror: most of the time they are dull, and they flash where they mirror
     light to the camera (dynamics.sparkle). The mean over particles stays."""

@@ -164,6 +164,8 @@ class Findings:
         denied: dict[str, float | bool] = {name: 0.0 for name in (*LIGHTS, "tumbling") if name in quality}
         if item.wind or (quality.get("wind", 0) > 1 and not item.kind):
             denied["wind"] = 0.0
+        if "colourful" in quality:
+            denied["colourful"] = False
         if "accumulates" in quality:
             denied["accumulates"] = not quality["accumulates"]
         self.denied |= denied
@@ -201,6 +203,7 @@ def _meant(word: str, known: list[str] | dict[str, Kind]) -> str | None:
 def _request(findings: Findings, kind: Kind, wanted: str) -> Request:
     rgb, dyed = kind.rgb, kind.dyed or kind.rgb is not None
     if findings.colours:
+        findings.factors.setdefault("colourful", False)
         rgb = mixed(findings.colours)
         if kind.rgb is not None and not kind.dyed:
             rgb = in_matter(kind.rgb, rgb, EFFECTS[kind.base].emission.kind)

@@ -38,6 +38,8 @@ class Request:
     dyed: bool = False
     """Whether the colours are those of the particles' own matter, exactly, since they are no snow, rain, fog or sand: petals,
     leaves, confetti, ash, smoke, embers."""
+    colourful: bool = False
+    """Whether each particle has a hue of its own: confetti, rainbow snow."""
     size: Annotated[float, Field(ge=0.2, le=5)] = 1.0
     """Factor on the diameter of the particles (the base's snowflakes have 1.5-12 mm)."""
     amount: Annotated[float, Field(ge=0.1, le=5)] = 1.0
