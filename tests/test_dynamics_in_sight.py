@@ -9,7 +9,7 @@ import torch
 from dynamics_particles import falling, looks, rollout
 
 from pgsd_nerfstudio.dynamics import DynamicsField, Rollout
-from pgsd_nerfstudio.dynamics.in_sight import Eye, fading_in
+from pgsd_nerfstudio.dynamics.in_sight import Eye, faded_in, fading_in
 from pgsd_nerfstudio.physics.air.reach import FADE
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
@@ -41,7 +41,9 @@ def test_pictures_of_what_is_in_sight_are_those_of_all(exposure, size):
         camera = random_cameras(1, 60, 44, seed)
         camera.viewmats[:, :3, 3] = -(camera.viewmats[:, :3, :3] @ torch.tensor([2.0, 2.0, 1.0]))
         frame = 4 * seed + 3
-        seen, everything = roll.gaussians(frame, eye=eye_of(camera)), roll.gaussians(frame)
+        # All of them, faded before the lens as the chosen ones are.
+        whole = next(roll.frames(frame, frame + 1))
+        seen, everything = roll.gaussians(frame, eye=eye_of(camera)), faded_in(whole, roll.history.reaches, eye_of(camera))
         fewest = min(fewest, len(seen) / len(everything))
         for found, expected in zip(scene.render(camera, seen), scene.render(camera, everything), strict=True):
             assert torch.equal(found, expected)
@@ -72,7 +74,11 @@ def test_particles_fade_in_within_their_reach_and_are_missing_beyond():
     center, near = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 4.0, 4.0, 4.0, 1e9])
     distances = torch.tensor([4.1, 4.0, 4.0 / (1 + FADE / 2), 4.0 / (1 + FADE), 100.0])
     places = center + distances[:, None] * torch.tensor([0.0, 0.6, 0.8])
-    assert fading_in(places, near, center).tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0], abs=1e-5)
+    small = torch.full((5,), 0.001)
+    assert fading_in(places, near, small, center).tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0], abs=1e-5)
+    lens = center + torch.tensor([0.2, 0.3, 0.45, 0.6, 1.5])[:, None] * torch.tensor([0.0, 0.6, 0.8])
+    assert fading_in(lens, near, small, center).tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0], abs=1e-5)
+    assert fading_in(lens, near, torch.full((5,), 0.5), center).tolist() == pytest.approx([0, 0, 0, 0, 0.5], abs=1e-5)
 
     history = falling(1500)
     roll = rolling(replace(history, reaches=torch.linspace(0.5, 3.0, 1500)), 0.0, 1.0)
@@ -84,7 +90,12 @@ def test_particles_fade_in_within_their_reach_and_are_missing_beyond():
     factor = torch.ones(len(everything))
     eye = torch.from_numpy(eye_of(camera).center).float()
     assert torch.allclose(eye, torch.tensor([2.0, 2.0, 1.0]), atol=1e-5)
-    factor[: len(active)] = fading_in(everything.means[: len(active)], torch.linspace(0.5, 3.0, 1500)[active], eye)
+    factor[: len(active)] = fading_in(
+        everything.means[: len(active)],
+        torch.linspace(0.5, 3.0, 1500)[active],
+        everything.scales[: len(active)].amax(1),
+        eye,
+    )
     expected = replace(everything, opacities=everything.opacities * factor)
     scene = CpuRasterizer(Gaussians.empty())
     pictures = [scene.render(camera, one).rgb for one in (seen, expected, everything)]

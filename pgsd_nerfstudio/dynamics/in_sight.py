@@ -99,19 +99,24 @@ class Extents(NamedTuple):
         return Extents(widening * active, collided)
 
 
-def fading_in(positions: Float[Tensor, "n 3"], reaches: Float[Tensor, " n"], center: Float[Tensor, "3"]) -> Float[Tensor, " n"]:
+def fading_in(
+    positions: Float[Tensor, "n 3"], reaches: Float[Tensor, " n"], sizes: Float[Tensor, " n"], center: Float[Tensor, "3"]
+) -> Float[Tensor, " n"]:
     """Factor on the opacity of flying particles: 0 farther from the camera than their reach, 1 from 1 / (1 + FADE) of it on.
 
-    Right before the lens a particle is out of focus and spread over so much of the picture that it is not seen: between 2 LENS
-    and LENS it fades out.
+    Right before the lens a particle is out of focus and spread over so much of the picture that it is not seen: between twice
+    LENS and LENS it fades out. A parcel of fog does so between four standard deviations and two, so that the picture does not
+    jump as the camera enters it.
 
     Args:
         positions: metres.
         reaches: `ParticleHistory.reaches` of the particles, metres.
+        sizes: largest standard deviations of the particles, metres.
         center: position of the camera, metres.
     """
     distances = (positions - center).norm(dim=1).clamp_min(1e-6)
-    return ((reaches / distances - 1.0) / FADE).clamp(0.0, 1.0) * (distances / LENS - 1.0).clamp(0.0, 1.0)
+    before = distances / (2.0 * sizes).clamp_min(LENS) - 1.0
+    return ((reaches / distances - 1.0) / FADE).clamp(0.0, 1.0) * before.clamp(0.0, 1.0)
 
 
 def faded_in(instant: RolloutFrame, reaches: Float[Tensor, " p"], eye: Eye) -> Gaussians:
@@ -124,7 +129,8 @@ def faded_in(instant: RolloutFrame, reaches: Float[Tensor, " p"], eye: Eye) -> G
     """
     gaussians, flying = instant.gaussians, len(instant.active)
     center = torch.from_numpy(eye.center).to(gaussians.means)
-    near = fading_in(gaussians.means[:flying], reaches[instant.active], center)
+    sizes = gaussians.scales[:flying].detach().amax(1)
+    near = fading_in(gaussians.means[:flying], reaches[instant.active], sizes, center)
     factors = torch.cat([near, near.new_ones(len(gaussians) - flying)])
     return replace(gaussians, opacities=gaussians.opacities * factors)
 
