@@ -47,7 +47,12 @@ KINDS: dict[str, Kind] = _spread(
     ("sleet", Kind("rainfall", (0.85, 0.88, 0.92), factors={"opacity": 1.3, "fall_speed": 0.6})),
     (
         "hail, hailstone, hailstorm",
-        Kind("rainfall", (0.92, 0.94, 0.97), None, {"size": 3.0, "fall_speed": 1.5, "opacity": 2.0, "accumulates": True}),
+        Kind(
+            "rainfall",
+            (0.92, 0.94, 0.97),
+            None,
+            {"size": 2.0, "amount": 0.3, "fall_speed": 1.5, "opacity": 2.0, "accumulates": True},
+        ),
     ),
     ("fog, mist", Kind("fog")),
     ("haze", Kind("fog", factors={"amount": 0.3})),
@@ -72,9 +77,12 @@ KINDS: dict[str, Kind] = _spread(
     ),
     ("confetti", _particle(size=1.5, amount=0.6, opacity=1.2, tumbling=3.5, colourful=True, accumulates=False)),
     ("feather", _particle(size=4.0, amount=0.15, fall_speed=0.5, tumbling=2.5)),
-    ("pollen", _particle((0.93, 0.8, 0.25), size=0.25, amount=0.6, fall_speed=0.2)),
+    ("pollen", _particle((0.93, 0.8, 0.25), size=0.5, amount=0.6, fall_speed=0.2, accumulates=False)),
     ("dandelion seed, dandelion, fluff", _particle(size=1.5, amount=0.2, fall_speed=0.4)),
-    ("dust mote, mote", _particle((0.9, 0.86, 0.76), size=0.2, amount=0.4, fall_speed=0.2, wind=0.3)),
+    (
+        "dust mote, mote",
+        _particle((0.9, 0.86, 0.76), size=0.4, amount=0.4, fall_speed=0.2, wind=0.3, glow=0.15, accumulates=False),
+    ),
     (
         "magic particle, magical particle, magic dust, fairy dust, pixie dust, stardust, star dust",
         _particle((0.8, 0.65, 1.0), amount=0.4, fall_speed=0.4, tumbling=2.0, glow=0.8, twinkle=1.0, accumulates=False),
