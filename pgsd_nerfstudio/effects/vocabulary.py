@@ -65,7 +65,7 @@ KINDS: dict[str, Kind] = _spread(
     # Embers are smaller than that, but so bright that a lens spreads their light.
     (
         "ember, spark",
-        _particle((1.0, 0.45, 0.1), SOOT, amount=0.5, fall_speed=0.3, tumbling=1.5, glow=1.0, twinkle=2.0, accumulates=False),
+        _particle((1.0, 0.45, 0.1), SOOT, amount=0.15, fall_speed=0.3, tumbling=1.5, glow=1.0, twinkle=2.0, accumulates=False),
     ),
     (
         "petal, blossom, cherry blossom, cherry petal, rose petal",
