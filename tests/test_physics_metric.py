@@ -243,7 +243,7 @@ def test_the_motion_prior_is_made_once(monkeypatch, tmp_path, capsys):
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[:, :3, 3] = torch.tensor([[0.0, -2, 1.5], [0.5, -2, 1.5]])
     poses[:, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # looking along +y
-    cameras = Cameras.from_opengl(poses, torch.eye(3).repeat(2, 1, 1), 64, 64)
+    cameras = Cameras.from_opengl(poses, torch.tensor([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]).repeat(2, 1, 1), 64, 64)
     scene = Scene("test", Gaussians.empty(), cameras, Frame(1.0, torch.eye(3), torch.zeros(3), ""), (), "a yard", None)
 
     def prior(**changes) -> ParticleHistory:
@@ -273,9 +273,8 @@ def test_the_motion_prior_is_made_once(monkeypatch, tmp_path, capsys):
     with pytest.raises(pytest.fail.Exception):
         prior()
     low, high = first.positions.min(0).values, first.positions.max(0).values
-    assert (low[:2] < torch.tensor([-1.0, -2.5])).all()
-    assert high[1] > 2.5  # ahead of the cameras
-    assert high[2] == pytest.approx(3.5, abs=0.1)
+    assert high[1] > 1.0 > low[1] > -3.5  # ahead of the cameras and a little around them
+    assert high[2] <= 3.5
 
 
 def test_the_summary_says_what_happened(history):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pgsd_nerfstudio.cli.asked import WeatherCommand
+from pgsd_nerfstudio.cli.console import say
 from pgsd_nerfstudio.refusal import Refusal, refusing
 
 if TYPE_CHECKING:

@@ -128,8 +128,8 @@ class RunState:
             arrays: what the method `arrays` returned.
             born: number of particles so far.
         """
-        groups = (Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in _GROUPS)
-        return RunState(*groups, without_prefix("deposits.", arrays), born)
+        groups = {group: Bodies(*(arrays[f"{group}.{f.name}"] for f in fields(Bodies))) for group in _GROUPS}
+        return RunState(**groups, deposits=without_prefix("deposits.", arrays), born=born)
 
 
 _GROUPS = ("flying", "sliding", "dense", "coming")

@@ -151,8 +151,8 @@ def _sight(effect: Effect, domain: Domain, cameras: Cameras | None) -> Sight:
 def _sharpness(effect: Effect, cameras: Cameras | None) -> float | None:
     """Distance up to which pictures tell particles apart, relative to their diameter; None where distance does not matter.
 
-    A parcel of fog is no droplet, and is seen at any distance. A storm carries all of its sand past any camera within seconds, so
-    that nothing is gained by knowing which grains come near.
+    A parcel of fog is no droplet, and is seen at any distance. A storm carries all of its sand past any camera within seconds,
+    so that nothing is gained by knowing which grains come near.
     """
     if cameras is None or len(cameras) == 0 or not effect.emission.precipitates:
         return None

@@ -185,9 +185,10 @@ class Shown:
         Args:
             view: the camera.
         """
-        if self.puddles is None or self.share == 0:
+        puddles = self.answer.puddles
+        if puddles is None or self.puddles is None or self.share == 0:
             return None
-        return self.puddles.drawn(view, lambda ids: self.lit(self.answer.puddles.rgb[ids], ids, None), self.share)
+        return self.puddles.drawn(view, lambda ids: self.lit(puddles.rgb[ids], ids, None), self.share)
 
     def altered(self, frozen: Gaussians) -> Gaussians:
         """The frozen Gaussians with the edits; without edits they are wider and more opaque under a cover, and followed by the

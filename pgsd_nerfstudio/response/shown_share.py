@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.air.reach import shown
-from pgsd_nerfstudio.physics.laws.populations import integral, number_density
+from pgsd_nerfstudio.physics.laws.populations import integral
 
 DISTANCES = np.concatenate([[0.0], np.geomspace(0.05, 200.0, 160)])  # m
 

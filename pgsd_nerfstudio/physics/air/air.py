@@ -189,7 +189,7 @@ class Air:
     def _margins(self, time: float) -> Float[ndarray, "2 3"]:
         """Metres around the domain from which particles may enter within a step: its lower and its upper sides."""
         wind = self.effect.wind
-        growth = float(law_of_the_wall(np.array(self.domain.upper[2:]), wind.roughness, wind.reference_height)[0])
+        growth = float(law_of_the_wall(np.array(self.domain.upper[2:], float), wind.roughness, wind.reference_height)[0])
         mean = np.array([*(growth * self.wind.at_reference(time)), 0.0])
         swirl = ROOM * wind.turbulence + WIDEST_SWAY * wind.flutter
         inward = np.array([mean + swirl, swirl - mean])

@@ -23,6 +23,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 MOST_CELLS = 12_000_000  # of the grid: 3 GB while it is made; larger domains get larger cells
 FRAMES = 3  # frames for which matter must be slow before it is at rest
+FEWEST = 30  # particles that move as a whole
 
 
 class Moved(NamedTuple):
@@ -63,8 +64,10 @@ class DenseMatter:
         cells = np.floor(np.concatenate([sliding.positions, dense.positions]) / self.cell).astype(np.int64)
         _, cell = np.unique(cells, axis=0, return_inverse=True)
         cell = cell.reshape(-1)
-        total = np.bincount(cell, np.concatenate([volumes, filled]))
-        return total[cell[: len(sliding)]] >= self.dense.solid_fraction * self.cell**3
+        full = np.bincount(cell, np.concatenate([volumes, filled])) >= self.dense.solid_fraction * self.cell**3
+        found = full[cell[: len(sliding)]]
+        # A few flakes that stand for many real ones may fill a cell, but are no mass that moves as a whole.
+        return found if found.sum() + len(dense) >= FEWEST else np.zeros_like(found)
 
     def add(self, bodies: Bodies, volumes: Float[ndarray, " n"]) -> None:
         """Add particles after the present ones.

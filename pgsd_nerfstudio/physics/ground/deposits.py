@@ -85,9 +85,9 @@ class Deposits:
             return np.zeros((0, 3)), np.zeros(0)
         effect = self.effect
         rate = effect.emission.intensity * MM_PER_HOUR / WATER
-        fallen = (rate * effect.timeline.fallen(seconds) for seconds in (before, after))
-        ran = (after_film(metres, effect.surface.accumulation_speedup) for metres in fallen)
-        edges, stands_for = self.drips.falling(*ran, rate)
+        speedup = effect.surface.accumulation_speedup
+        earlier, later = (after_film(rate * effect.timeline.fallen(seconds), speedup) for seconds in (before, after))
+        edges, stands_for = self.drips.falling(earlier, later, rate)
         return self.drips.places[edges], stands_for
 
     def wet(self, bodies: Bodies, share: Float[ndarray, " n"]) -> None:
