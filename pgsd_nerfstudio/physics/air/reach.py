@@ -41,7 +41,7 @@ def reaches(near: Float[ndarray, " n"], least: float, draw: Float[ndarray, " n"]
     return near * np.maximum(draw * kept(near, least), 1e-12) ** (-1 / 3)
 
 
-def shown(near: ndarray, distance: ndarray) -> ndarray:
+def shown(near: ndarray, distance: ndarray | float) -> ndarray:
     """Mean share of the light of all particles that those shown at a distance take, 0..1, fading included.
 
     The fade is linear in reach / d from 1 to 1 + FADE, so that the mean is the average of the chance of being kept over that
