@@ -212,7 +212,9 @@ def _look(request: Request, state: StateLook) -> StateLook:
     """The changes that active and collided particles share."""
     opacity = None if state.opacity is None else min(state.opacity * request.opacity, 1.0)
     scale_m = None if state.scale_m is None else _times(state.scale_m, request.size)
-    return replace(state, opacity=opacity, scale_m=scale_m, colourful=state.colourful or request.colourful)
+    # One colour that is asked for takes the place of all hues.
+    colourful = request.colourful or (state.colourful and request.rgb is None)
+    return replace(state, opacity=opacity, scale_m=scale_m, colourful=colourful)
 
 
 def _times(axes: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
