@@ -94,7 +94,7 @@ def test_gaussians_under_the_ground_belong_to_it_and_those_in_the_air_do_not():
     """The ground lets light through to Gaussians deep below it; they show the mulch on it, and that gets the snow."""
     found = Exposure.of(flat_at(torch.tensor([[0.0, 0, -0.3], [0.0, 0, -1.4], [0.0, 0, 0.7]])), mesh(GROUND), CALM)
     assert found.loose.tolist() == [False, False, True]
-    assert found.catches[:2] == pytest.approx([1.0, 1.0], abs=1e-5) and 0 < found.catches[2] <= 1.0
+    assert found.catches[:2] == pytest.approx([1.0, 1.0], abs=1e-5) and 0 < found.catches[2] <= 1.0001
 
 
 def test_what_stands_under_a_table_is_no_part_of_it():
