@@ -55,7 +55,7 @@ def simulate(
         fps: frames per second of the simulation.
         seed: another seed gives another weather of the same kind.
         max_particles: most particles that cameras see at once, a bound for machines: where it is reached, fewer are told apart
-            far away. By default 200,000, with CUDA 1,000,000.
+            far away. By default 100,000, with CUDA 1,000,000.
         physics: `metric` is right in SI units, `paper` is the publication's solver and numbers.
         everything: simulate also the air that no camera of the scene sees.
         collisions: whether particles meet the scene's surface.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FLAT = tyro.conf.arg(name="")
 """Marks a group of options whose flags carry no prefix."""
 
-PARTICLES_CPU, PARTICLES_CUDA = 200_000, 1_000_000
+PARTICLES_CPU, PARTICLES_CUDA = 100_000, 1_000_000
 """Most particles that cameras see at once, where nothing is asked for: what pictures take in reasonable time."""
 TRAINED_CPU, TRAINED_CUDA = 20_000, 100_000
 """The same for training, which rolls all of them out again and again."""
@@ -97,7 +97,7 @@ class SimulationOptions:
     max_particles: int | None = None
     """Bound for time and memory: most particles that cameras see at once. All that a picture tells apart are there, as far as
     this allows; what is too far away is haze. Droplets of splashes come on top; --physics paper has its own number.
-    By default 200,000 (training: 20,000), with CUDA 1,000,000 (training: 100,000)."""
+    By default 100,000 (training: 20,000), with CUDA 1,000,000 (training: 100,000)."""
     physics: Literal["metric", "paper"] = "metric"
     """metric is right in SI units; paper is the publication's solver and numbers (MPM throughout in a unit cube, no air),
     to compare with."""

@@ -60,7 +60,7 @@ class _Shown:
 
 
 def _weather(
-    prepared: PreparedScene, kind: Effect, path: Cameras, frames: int, sharpness: float | None = None, most: int = 200_000
+    prepared: PreparedScene, kind: Effect, path: Cameras, frames: int, sharpness: float | None = None, most: int = 100_000
 ) -> Weather:
     """A weather over ground and furniture; what is seen of it is not kept in the cache."""
     scene, kind = prepared.scene, adapted(kind, prepared)[0]
@@ -154,7 +154,7 @@ def _thinning(prepared: PreparedScene, path: Cameras, view: Cameras) -> Iterator
         kind = effect(name, intensity=intensity)
         kind = replace(kind, appearance=replace(kind.appearance, legibility=1.0))
         full = _shown(_weather(prepared, kind, path, 1, sharpness=1e5, most=ALL), view, 0)
-        for most in (200_000, 20_000):
+        for most in (100_000, 20_000):
             weather = _weather(prepared, kind, path, 1, most=most)
             thin = _shown(weather, view, 0)
             light = [float(luminance(linear(shown.weather).reshape(-1, 3)).mean()) for shown in (thin, full)]
