@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -68,7 +69,9 @@ def lesson():
                 group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * step / STEPS))
             which = step % len(PATHS)
             instants = rollout.window(PATHS[which][2], frames, begin="simulation")
-            weather = [scene.frame.gaussians_to_scene(one.gaussians) for one in instants]
+            # The prior's clips were drawn with footprints that are never thinner than a pixel.
+            wide = [replace(one.gaussians, antialiased=False, whole=False) for one in instants]
+            weather = [scene.frame.gaussians_to_scene(one) for one in wide]
             clip = rasterizer.render(paths[which], weather).rgb.permute(0, 3, 1, 2)
             guidance, scale = torch.zeros(()), 1.0
             if taught:

@@ -71,6 +71,14 @@ class RunOptions:
         return {"field": self.learning.lr, "look": self.learning.look_lr} if self.taught else {"field": 0.0, "look": 0.0}
 
     @property
+    def knows_wide_flakes(self) -> bool:
+        """Whether the prior has only seen clips in which a flake is never thinner than a pixel, as the bundled one has.
+
+        Its clips are drawn so; everything else shows what particles cover.
+        """
+        return self.guidance.prior == "bundled"
+
+    @property
     def answering_clips(self) -> bool:
         """Whether training clips show the scene's answer."""
         shown = self.clips.surfaces_in_clips

@@ -152,6 +152,8 @@ class WeatherPipeline(VanillaPipeline):
             eyes = [Eye.of(views[k], config, place) for k in range(len(views))]
             reaches = model.history.reaches
             shown = [faded_in(one, reaches, eye) for one, eye in zip(instants, eyes, strict=True)]
+            if options.knows_wide_flakes:
+                shown = [replace(one, antialiased=False, whole=False) for one in shown]
             weather = [place.gaussians_to_scene(one) for one in shown]
         with watch("render"):
             answering = options.answering_clips
