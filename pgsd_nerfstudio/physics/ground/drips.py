@@ -18,7 +18,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from pgsd_nerfstudio.physics.clock import Domain
-from pgsd_nerfstudio.physics.ground.standing_water import CELL, FILM, MAX_CELLS, flood, heights_below
+from pgsd_nerfstudio.physics.ground.flooding import flood
+from pgsd_nerfstudio.physics.ground.ground_map import heights_below
+from pgsd_nerfstudio.physics.ground.standing_water import CELL, FILM, MAX_CELLS
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 DRIPPED = 8  # bit of a body's kinds: it has dripped from an edge
@@ -51,7 +53,7 @@ class Drips:
         shape = tuple(np.maximum(np.floor(np.asarray(domain.size[:2]) / cell).astype(int), 1))
         x, y = (lower[k] + cell * np.arange(shape[k]) for k in range(2))
         at = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-        heights = heights_below(surface, at, np.full(len(at), domain.upper[2]))
+        heights = heights_below(surface, at, np.full(len(at), float(domain.upper[2])))
         return Drips.on(heights.reshape(shape), lower, cell)
 
     @staticmethod
