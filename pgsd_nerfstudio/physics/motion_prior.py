@@ -106,6 +106,7 @@ def summary(history: ParticleHistory) -> str:
     active = np.cumsum(change)[: history.frames]
     about = history.about
     landed, stands_for = int(history.collided.sum()), float(history.represents.mean()) if len(history) else 0.0
+    whom = f"each stands for {stands_for:.3g} real ones" if stands_for > 1.005 else "each is a real one"
     ways = {
         "slid": "slid",
         "dense": "were dense matter",
@@ -116,7 +117,7 @@ def summary(history: ParticleHistory) -> str:
     return (
         f"{about.get('effect', 'motion prior')}: {len(history):,} particles over {history.frames} frames, "
         f"{active.mean():,.0f} on their way on average (at most {active.max():,}), {landed:,} landed{regimes}; "
-        f"each stands for {stands_for:.3g} real ones, {about.get('air_simulated', 1.0):.0%} of the air "
+        f"{whom}, {about.get('air_simulated', 1.0):.0%} of the air "
         f"simulated, {about.get('seconds', 0.0):.1f} s"
     )
 
