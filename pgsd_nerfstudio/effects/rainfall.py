@@ -31,7 +31,7 @@ RAINFALL = register(
                 rgb=(0.92, 0.94, 0.97),
                 tone_spread=0.1,
             ),
-            legibility=10.0,
+            legibility=8.0,
             exposure=1 / 50,
         ),
         haze=Haze(rgb=(0.62, 0.66, 0.70)),

@@ -17,6 +17,7 @@ from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate_met
 from pgsd_nerfstudio.physics.air.deflection import Deflection
 from pgsd_nerfstudio.physics.bodies import GRAVITY, SPLASHED, Bodies
 from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
+from pgsd_nerfstudio.physics.ground.drips import DRIPPED
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.codec import encode
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
@@ -147,6 +148,7 @@ def _wet_error() -> float:
     droplets = (run.kinds & SPLASHED) > 0
     last = run.positions[run.offsets[1:] - 1][:, 2]
     down = (last < 1e-3) | ((last - 0.75).abs() < 1e-3)
+    down &= (run.kinds & DRIPPED) == 0  # their water has been counted where it fell first
     fallen = float(masses[down].sum() - masses[droplets].sum())
     held = run.about["water_kg"] + run.about["water_evaporated_kg"] + run.about["water_missed_kg"]
     return 100 * abs(held / fallen - 1)

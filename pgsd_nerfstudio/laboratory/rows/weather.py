@@ -105,7 +105,7 @@ def _wall(scene: Scene, visibility: float, metres: float, *, white_wall: bool, r
     """
     fog = effect("fog", intensity=visibility)
     assert fog.haze is not None
-    haze = replace(fog.haze, rgb=(0.0,) * 3 if white_wall else (1.0,) * 3, patchiness=0.0)
+    haze = replace(fog.haze, rgb=(0.0,) * 3 if white_wall else (1.0,) * 3, patchiness=0.0, scale_height=math.inf)
     even = replace(fog, haze=haze, appearance=replace(fog.appearance, active=replace(fog.appearance.active, opacity=0.5)))
     unit = scene.frame.metres_per_unit
     medium = HazeField.of(even, scene.frame, domain_of(scene)).at(0.0)
