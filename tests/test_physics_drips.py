@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.effects import RAINFALL
+from pgsd_nerfstudio.physics.bodies import DRIPPED
 from pgsd_nerfstudio.physics.clock import Clock, Domain
-from pgsd_nerfstudio.physics.ground.drips import DIAMETER, DRIPPED, Drips, after_film
+from pgsd_nerfstudio.physics.ground.drips import DIAMETER, Drips, after_film
 from pgsd_nerfstudio.physics.metric import simulate_metric
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 

@@ -18,7 +18,9 @@ LANDED, ABSORBED, LEFT, UNSEEN = 0, 1, 2, 3  # how a particle ended; a particle 
 ENDS = {"landed": LANDED, "absorbed": ABSORBED, "left": LEFT, "unseen": UNSEEN}
 ANY_DISTANCE = np.float32(1e9)  # m; the reach of a particle that is shown however far it is
 NO_END = np.iinfo(np.int32).max  # frame
-SPLASHED, SLID, DENSE = 1, 2, 4  # bits of `kinds`: the particle is a splash droplet, has slid, has been dense matter
+SPLASHED, SLID, DENSE, DRIPPED = 1, 2, 4, 8
+"""Bits of `kinds`: the particle is a splash droplet, has slid, has been dense matter, has dripped from an edge or splashed from
+what has."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,22 @@ from pgsd_nerfstudio.physics.air.air import Air
 from pgsd_nerfstudio.physics.air.emitters import Newcomers
 from pgsd_nerfstudio.physics.air.leaving import Leaving
 from pgsd_nerfstudio.physics.air.splash import splashed
-from pgsd_nerfstudio.physics.bodies import ABSORBED, ANY_DISTANCE, DENSE, LEFT, SLID, SPLASHED, UNSEEN, Bodies, RunState
+from pgsd_nerfstudio.physics.bodies import (
+    ABSORBED,
+    ANY_DISTANCE,
+    DENSE,
+    DRIPPED,
+    LEFT,
+    SLID,
+    SPLASHED,
+    UNSEEN,
+    Bodies,
+    RunState,
+)
 from pgsd_nerfstudio.physics.curve import along_curve
 from pgsd_nerfstudio.physics.flock import Flock
 from pgsd_nerfstudio.physics.ground.deposits import Deposits
-from pgsd_nerfstudio.physics.ground.drips import DIAMETER, DRIPPED
+from pgsd_nerfstudio.physics.ground.drips import DIAMETER
 from pgsd_nerfstudio.physics.ground.landing import Meeting
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.chunks import Chunk

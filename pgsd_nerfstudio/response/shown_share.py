@@ -45,7 +45,8 @@ class ShownShare:
         """
         diameters, density = areas
         inside = (diameters >= effect.emission.smallest) & (diameters <= effect.emission.largest)
-        taken = np.array([integral(density * inside * shown(sharpness * diameters, at), diameters) for at in DISTANCES.tolist()])
+        drawn = (density * inside * shown(sharpness * diameters, at) for at in DISTANCES.tolist())
+        taken = np.array([integral(one, diameters) for one in drawn])
         left = 1.0 - 0.5 * taken / integral(density, diameters)
         # The trapezoidal rule over each step.
         lengths = np.concatenate([[0.0], np.cumsum(0.5 * (left[1:] + left[:-1]) * np.diff(DISTANCES))])

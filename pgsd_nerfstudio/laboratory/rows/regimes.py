@@ -15,9 +15,8 @@ from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.laboratory.surfaces import FACES, floor_and_table
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, simulate_metric
 from pgsd_nerfstudio.physics.air.deflection import Deflection
-from pgsd_nerfstudio.physics.bodies import GRAVITY, SPLASHED, Bodies
+from pgsd_nerfstudio.physics.bodies import DRIPPED, GRAVITY, SPLASHED, Bodies
 from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
-from pgsd_nerfstudio.physics.ground.drips import DRIPPED
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.codec import encode
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
@@ -145,7 +144,7 @@ def _wet_error() -> float:
         floor_and_table(), replace(RAINFALL, wind=STILL), Clock(frames=50), DOMAIN, max_particles=800, progress=False
     )
     masses = RAINFALL.material.mass(run.diameters.double()) * run.represents.double()
-    droplets = (run.kinds & SPLASHED) > 0
+    droplets = ((run.kinds & SPLASHED) > 0) & ((run.kinds & DRIPPED) == 0)
     last = run.positions[run.offsets[1:] - 1][:, 2]
     down = (last < 1e-3) | ((last - 0.75).abs() < 1e-3)
     down &= (run.kinds & DRIPPED) == 0  # their water has been counted where it fell first

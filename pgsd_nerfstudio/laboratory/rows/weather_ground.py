@@ -19,8 +19,7 @@ from pgsd_nerfstudio.effects.effect import effect
 from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.laboratory.records import Record
 from pgsd_nerfstudio.physics import Clock, Domain, ParticleHistory, domain_of, simulate_metric
-from pgsd_nerfstudio.physics.bodies import SLID, SPLASHED
-from pgsd_nerfstudio.physics.ground.drips import DRIPPED
+from pgsd_nerfstudio.physics.bodies import DRIPPED, SLID, SPLASHED
 from pgsd_nerfstudio.physics.laws.fall_speeds import rain_fall_speed
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.scene import rotations
@@ -196,7 +195,7 @@ def _water(scene: Scene, surface: SurfaceMesh, quick: bool) -> Record:
     masses = RAINFALL.material.mass(run.diameters.double()) * run.represents.double()
     down = surface.closest(run.positions[run.offsets[1:] - 1]).distance < DEPTH
     down &= (run.kinds & DRIPPED) == 0  # their water has been counted where it fell first
-    droplets = (run.kinds & SPLASHED) > 0
+    droplets = ((run.kinds & SPLASHED) > 0) & ((run.kinds & DRIPPED) == 0)
     fallen, off = float(masses[down].sum()), float(masses[droplets].sum())
     found = run.about["water_deposited_kg"] + run.about["water_missed_kg"] + off
     return Record.judged(

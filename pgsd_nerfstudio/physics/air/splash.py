@@ -9,7 +9,7 @@ from numpy import ndarray
 from pgsd_nerfstudio.effects.surface_response import Splash
 from pgsd_nerfstudio.physics.air.air import Air
 from pgsd_nerfstudio.physics.air.emitters import Newcomers
-from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, SPLASHED, Bodies
+from pgsd_nerfstudio.physics.bodies import ANY_DISTANCE, DRIPPED, SPLASHED, Bodies
 
 LIFT = 0.004  # m above the surface at which droplets start
 STEEP = (35.0, 65.0)  # degrees above the surface, between which droplets fly off
@@ -72,5 +72,6 @@ def splashed(
     new = air.newborn(Newcomers(drops.positions[parent] + LIFT * normal, diameters, reaches), velocity, rng)
     needed = air.sight.needed(new.positions, new.reaches)
     new.represents[:] = drops.represents[parent]
+    new.kinds[:] = drops.kinds[parent] & DRIPPED
     new = new.select(needed)
     return new.marked(SPLASHED), share

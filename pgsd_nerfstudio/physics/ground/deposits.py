@@ -10,11 +10,11 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.effects.appearance import REACH, layer_volume
 from pgsd_nerfstudio.effects.effect import Effect
-from pgsd_nerfstudio.physics.bodies import Bodies, with_prefix, without_prefix
+from pgsd_nerfstudio.physics.bodies import DRIPPED, Bodies, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
 from pgsd_nerfstudio.physics.ground.dense import DenseMatter
-from pgsd_nerfstudio.physics.ground.drips import DRIPPED, Drips, after_film
+from pgsd_nerfstudio.physics.ground.drips import Drips, after_film
 from pgsd_nerfstudio.physics.ground.wetness import WetnessGrid, Wetting
 from pgsd_nerfstudio.physics.laws.populations import MM_PER_HOUR
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh

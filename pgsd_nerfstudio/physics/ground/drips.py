@@ -23,7 +23,6 @@ from pgsd_nerfstudio.physics.ground.ground_map import heights_below
 from pgsd_nerfstudio.physics.ground.standing_water import CELL, FILM, MAX_CELLS
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-DRIPPED = 8  # bit of a body's kinds: it has dripped from an edge
 DIAMETER = 0.0045  # m
 EDGE = 0.12  # m; water that goes farther down between two cells falls
 SLOWEST = 0.02  # drops a second of an edge; less water than that evaporates or creeps below
