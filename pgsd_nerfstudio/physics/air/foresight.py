@@ -21,7 +21,7 @@ from pgsd_nerfstudio.physics.bodies import NO_END, Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 
 STRIDE = 1.2  # m; about the longest way of a step
-MOST_FRAMES = 5  # of a step
+MOST_FRAMES = 10  # of a step
 HORIZON = 60.0  # s; particles that are still on their way then are simulated to the end
 
 
