@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.scene.camera_path import choose_views
@@ -61,6 +61,14 @@ class Domain:
     def volume(self) -> float:
         """m^3."""
         return self.area * self.size[2]
+
+    def contains(self, points: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Whether each point is in the box, its sides included.
+
+        Args:
+            points: in metres.
+        """
+        return ((points >= self.lower) & (points <= self.upper)).all(1)
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, " n"]:
         """Distance of each point from the box in metres, 0 inside.

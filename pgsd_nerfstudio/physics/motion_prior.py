@@ -129,6 +129,6 @@ def _paper(
     from pgsd_nerfstudio.physics.paper import paper_config, simulate_paper  # starts Taichi
 
     means = scene.frame.to_metric(scene.gaussians.means.float()).cpu().numpy().astype(np.float64)
-    inside = ((means >= domain.lower) & (means <= domain.upper)).all(1)
+    inside = domain.contains(means)
     config = replace(paper_config(effect.name), fps=clock.fps)
     return simulate_paper(surface, means[inside], config, domain, frames=clock.frames, seed=seed, progress=progress)

@@ -161,7 +161,7 @@ class Air:
         speeds = fall_speed(found.diameters, self.effect.material)
         velocities = self.settled(found.positions, speeds, time - 0.5 * self.step)
         moved = found._replace(positions=found.positions + velocities * self.step)
-        inside = ((moved.positions >= self.domain.lower) & (moved.positions <= self.domain.upper)).all(1)
+        inside = self.domain.contains(moved.positions)
         # The position of a front is that of this frame.
         arrived = self.arrival.times(moved.positions, self.draws(frame, SHOWN).uniform(size=len(inside))) <= time
         enters = inside & arrived & self.sight.needed(moved.positions, moved.reaches)
@@ -219,14 +219,10 @@ class Air:
         rng, before, time = self.draws(frame, AHEAD), (frame - 1) * self.step, frame * self.step
         found = fill(self.sizes, self.domain, self.sight, rng, self._before_front(before))
         found = found.select(self.arrival.times(found.positions) > before)
-        new = self.newborn(found, np.zeros_like(found.positions), rng)
-        # Particles of almost no terminal speed take the air's velocity at once, so the kernel yields settled velocities; it is
-        # many times faster than `settled`.
-        weightless, none = np.full(len(new), 1e-9, np.float32), Flutter.none(len(new))
-        advance(new.positions.copy(), new.velocities, weightless, none, self.wind, before, self.step)
-        new.velocities[:, 2] -= new.speeds
+        speeds = fall_speed(found.diameters, self.effect.material)
+        new = self.newborn(found, self.settled(found.positions, speeds, before + 0.5 * self.step), rng)
         self.fly(new, frame, WALK_AHEAD)
-        inside = ((new.positions >= self.domain.lower) & (new.positions <= self.domain.upper)).all(1)
+        inside = self.domain.contains(new.positions)
         inside &= self.sight.needed(new.positions, new.reaches) & self.arrival.passed(new.positions, time)
         inside[inside] = ~self.shadowed(new.positions[inside], new.speeds[inside], time)
         return self._that_matter(new.select(inside), frame)

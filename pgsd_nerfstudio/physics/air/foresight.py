@@ -44,7 +44,6 @@ def foresee(bodies: Bodies, frame: int, *, step: float, wind: WindField, domain:
         return bodies
     speed = float(np.linalg.norm(bodies.velocities, axis=1).max())
     frames = int(np.clip(STRIDE / max(speed * step, 1e-6), 1, MOST_FRAMES))
-    lower, upper = np.asarray(domain.lower, np.float32), np.asarray(domain.upper, np.float32)
     first, last = np.full(count, NO_END, np.int32), np.full(count, -1, np.int32)
     began = bodies.positions.copy(), bodies.velocities.copy()
     under_way, moving, now = np.arange(count), Bodies.join([bodies]), frame
@@ -53,12 +52,12 @@ def foresee(bodies: Bodies, frame: int, *, step: float, wind: WindField, domain:
         flutter = Flutter(moving.sways, moving.hertz, moving.phases)
         advance(moving.positions, moving.velocities, moving.speeds, flutter, wind, now * step, frames * step)
         seen = _watch(before, moving.positions, moving.reaches, sight.seen_distances, sight.lower, 1 / sight.cell)
-        new = under_way[seen & (first[under_way] == NO_END)]
         fresh = seen & (first[under_way] == NO_END)
+        new = under_way[fresh]
         first[new], began[0][new], began[1][new] = now, before[fresh], speeds[fresh]
         last[under_way[seen]] = now + frames
         now += frames
-        inside = ((moving.positions >= lower) & (moving.positions <= upper)).all(1)
+        inside = domain.contains(moving.positions)
         under_way, moving = under_way[inside], moving.select(inside)
     last[under_way] = np.where(first[under_way] == NO_END, -1, NO_END)
     matters = last >= 0
