@@ -14,6 +14,7 @@ import numpy as np
 
 from pgsd_nerfstudio.effects.matter import Kind
 from pgsd_nerfstudio.effects.request import Rgb
+from pgsd_nerfstudio.effects.srgb import light_of, srgb_of
 
 _CONES = np.array(
     [
@@ -89,9 +90,7 @@ def mixed_evenly(first: Rgb, second: Rgb, share: float) -> Rgb:
 
 def oklab(rgb: Rgb) -> np.ndarray:
     """[3] lightness 0..1, green to red, and blue to yellow of an sRGB colour in 0..1."""
-    c = np.asarray(rgb, dtype=np.float64)
-    light = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return _LAB @ np.cbrt(_CONES @ light)
+    return _LAB @ np.cbrt(_CONES @ light_of(np.array(rgb)))
 
 
 def polar(rgb: Rgb) -> tuple[float, float, float]:
@@ -116,6 +115,5 @@ def _shown(lightness: float, chroma: float, hue: float) -> tuple[np.ndarray, boo
     """[3] the sRGB values of a colour, and whether they lie in 0..1."""
     lab = np.array([lightness, chroma * math.cos(hue), chroma * math.sin(hue)])
     light = np.linalg.solve(_CONES, np.linalg.solve(_LAB, lab) ** 3)
-    above = np.clip(light, 0.0031308, None)
-    rgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * above ** (1 / 2.4) - 0.055)
+    rgb = srgb_of(light)
     return rgb, bool((rgb >= -1e-6).all() and (rgb <= 1 + 1e-6).all())

@@ -12,9 +12,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from matplotlib.colors import CSS4_COLORS, XKCD_COLORS, to_rgb
 
 from pgsd_nerfstudio.effects.request import Base, Rgb
+from pgsd_nerfstudio.effects.srgb import light_of, srgb_of
 
 
 def _spread(*rows: tuple[str, Any]) -> dict[str, Any]:
@@ -237,16 +239,8 @@ def mixed(colours: Sequence[Rgb]) -> Rgb:
     """The colour of a mixture of particles seen from afar: the mean of their linear light (IEC 61966-2-1 for sRGB)."""
     if len(colours) == 1:
         return colours[0]
-    red, green, blue = (_encoded(sum(map(_light, parts)) / len(parts)) for parts in zip(*colours, strict=True))
+    red, green, blue = np.minimum(srgb_of(light_of(np.array(colours)).mean(0)), 1.0).tolist()
     return red, green, blue
-
-
-def _light(c: float) -> float:
-    return c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
-
-
-def _encoded(light: float) -> float:
-    return 12.92 * light if light <= 0.0031308 else min(1.055 * light ** (1 / 2.4) - 0.055, 1.0)
 
 
 ENDINGS = {"ies": ("y",), "es": ("",), "s": ("",), "ily": ("y",), "ly": ("", "le"), "ish": ("", "e")}
