@@ -136,8 +136,10 @@ class Compare:
     def simulated(self, python: Path, case: Path, name: str, count: int, frames: int) -> list[float]:
         """CPU seconds, seconds by the clock, rows, and most memory in KiB of one simulation in a process of its own."""
         command = [str(python.absolute()), "-c", RUN, str(case), name, str(count), str(frames), "seen" if self.seen else "all"]
-        # In a folder of their own, so that each build finds its own package and not the one of the present folder.
-        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        # In a folder of their own, so that each build finds its own package and not the one of the present folder. Both keep
+        # compiled bytecode, as Python does by default.
+        left_out = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
+        environment = {key: value for key, value in os.environ.items() if key not in left_out}
         done = subprocess.run(command, cwd=case.parent, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{python} could not simulate {name}:\n{done.stderr}")
