@@ -135,6 +135,15 @@ class Effect:
         fixed = replace(self.adaptation, visibility=None)
         return replace(self, emission=replace(self.emission, intensity=intensity), adaptation=fixed)
 
+    def with_legibility(self, legibility: float) -> Effect:
+        """The same weather at a legibility, whatever the scene; at 1 particles cover what they cover in nature.
+
+        Raises:
+            ValueError: the legibility is out of its range.
+        """
+        fixed = replace(self.adaptation, air=None)
+        return replace(self, appearance=replace(self.appearance, legibility=legibility), adaptation=fixed)
+
     def prompt_for(self, description: str) -> str:
         """The prompt for a scene with this description, such as "a garden"."""
         return self.prompt.format(scene=description)

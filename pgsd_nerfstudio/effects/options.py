@@ -22,7 +22,7 @@ from pgsd_nerfstudio.effects.effect import full_name
 from pgsd_nerfstudio.effects.matter import CONTRASTS, Visibility
 
 if TYPE_CHECKING:
-    from pgsd_nerfstudio.effects.effect import Appearance, Effect, Wind
+    from pgsd_nerfstudio.effects.effect import Effect, Wind
     from pgsd_nerfstudio.effects.haze import Haze
     from pgsd_nerfstudio.effects.language_model import Understanding
     from pgsd_nerfstudio.effects.request import Rgb
@@ -103,7 +103,8 @@ class EffectOptions:
     By default the effect's own, which for snow is 0, no motion blur."""
     legibility: float | None = None
     """Factor on the area of all that flies, 1-1000. At 1 it takes as much light as in nature: right for data sets and for
-    comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking and said if it is not 1."""
+    comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking, and for snow and rain more
+    where a scene has little air before its background; said if it is not 1."""
 
     def __post_init__(self) -> None:
         # Stored options, and the commands that are made of them, have one name for one weather.
@@ -141,9 +142,10 @@ class EffectOptions:
             emission=replace(effect.emission, visibility=self.visibility),
             haze=self._haze(effect.haze),
             ambience=effect.ambience if self.ambience else None,
-            appearance=self._appearance(effect.appearance),
             adaptation=effect.adaptation if self.wind_direction is None else replace(effect.adaptation, wind_across=False),
         )
+        if self.legibility is not None:
+            effect = effect.with_legibility(self.legibility)
         return effect, [*said, *legible(effect)]
 
     def check(self) -> None:
@@ -235,9 +237,6 @@ class EffectOptions:
             surface = replace(surface, landing="vanishes")  # drops still splash
         return surface
 
-    def _appearance(self, appearance: Appearance) -> Appearance:
-        return appearance if self.legibility is None else replace(appearance, legibility=self.legibility)
-
     def _haze(self, haze: Haze | None) -> Haze | None:
         rgb = None if self.haze_color is None else colour_of("haze-color", self.haze_color)
         return None if haze is None else replace(haze, amount=haze.amount * self.haze, rgb=rgb or haze.rgb)
@@ -257,9 +256,9 @@ class EffectOptions:
 
 
 def legible(effect: Effect) -> list[str]:
-    """What is to be said about how much more of a view particles take than in nature."""
+    """What is to be said about how much more of a view particles take than in nature; nothing while that follows the scene."""
     factor = effect.appearance.legibility
-    if factor == 1:
+    if factor == 1 or effect.adaptation.air is not None:
         return []
     return [
         f"what flies is drawn with {factor:g} times its area, {factor**0.5:.2g} times as wide (--legibility 1: as in nature)"

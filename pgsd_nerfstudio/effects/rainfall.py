@@ -6,6 +6,7 @@ physics.laws.fall_speeds.
 
 from __future__ import annotations
 
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Appearance, Effect, StateLook, Wind, register
 from pgsd_nerfstudio.effects.haze import Haze
@@ -35,6 +36,7 @@ RAINFALL = register(
             exposure=1 / 50,
         ),
         haze=Haze(rgb=(0.62, 0.66, 0.70)),
+        adaptation=Adaptation(air=7.5),
         ambience=Ambience(clouds=0.95, stops=-0.3, tint=(0.94, 1.0, 1.07), saturation=0.8, sky=(0.66, 0.70, 0.74)),
         prompt="Heavy rain is falling in {scene}, raindrops streak through the air and splash, surfaces are wet and dark. "
         "Photorealistic, high detail",

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.ambience import Ambience
 from pgsd_nerfstudio.effects.effect import Appearance, Effect, StateLook, Wind, register
 from pgsd_nerfstudio.effects.haze import Haze
@@ -42,6 +43,7 @@ SNOWFALL = register(
             ),
         ),
         haze=Haze(rgb=(0.885, 0.895, 0.91)),
+        adaptation=Adaptation(air=7.5),
         ambience=Ambience(clouds=1.0, stops=-0.1, tint=(0.97, 1.0, 1.04), saturation=0.8, sky=(0.95, 0.96, 0.975)),
         prompt="Fluffy snowflakes are falling in {scene}, accumulating on surfaces. Photorealistic, high detail",
         negative_prompt="static, no snow, blurry, distorted, cartoon, low quality, grey, dirty, dark, ugly",

@@ -120,14 +120,13 @@ def changed_rows(prepared: PreparedScene, path: Cameras, view: Cameras, instants
     """
     for name, (intensity, low, high) in WANTED.items():
         own = effect(name, intensity=intensity)
-        for legibility in dict.fromkeys((own.appearance.legibility, 1.0)):
-            kind = replace(own, appearance=replace(own.appearance, legibility=legibility))
-            weather = weather_along(prepared, kind, path, instants[-1] + 1)
+        for kind in (own, own.with_legibility(1.0)):
+            weather, asked = weather_along(prepared, kind, path, instants[-1] + 1), kind is own
+            factor = weather.effect.appearance.legibility
             found = 100 * float(np.mean([shown(weather, view, frame).changed for frame in instants]))
-            asked = legibility == own.appearance.legibility
             yield Record(
-                f"{name}, {intensity:g} mm/h, {prepared.scene.name}: pixels that flying particles change, legibility "
-                f"{legibility:g}",
+                f"{name}, {intensity:g} mm/h, {prepared.scene.name}: pixels that flying particles change, "
+                f"{'default ' if asked else ''}legibility {factor:g}",
                 found,
                 "%",
                 target=f">= {low:g}" if asked else None,

@@ -1,4 +1,4 @@
-"""An effect as a scene has it: what nobody asked for follows the distance of its background and the way its cameras look."""
+"""An effect as a scene has it: what nobody asked for follows the distance of what its cameras see and the way they look."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from pgsd_nerfstudio.effects import Effect
+from pgsd_nerfstudio.effects.adaptation import Adaptation
 from pgsd_nerfstudio.effects.matter import INTENSITIES
+from pgsd_nerfstudio.effects.options import legible
 from pgsd_nerfstudio.scene.camera_path import choose_views
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.weather.prepared_scene import PreparedScene
@@ -18,6 +22,8 @@ VIEWS = 5  # cameras that are asked for their background
 WIDTH = 96  # pixels
 BEHIND = 0.7  # share of a picture that is nearer than its background
 SOLID = 0.5  # accumulation from which a pixel shows something
+FAR = 12.0  # m; rain's particles are drawn up to about here
+MOST = 4.0  # times the legibility of the effect
 
 
 def adapted(effect: Effect, prepared: PreparedScene) -> tuple[Effect, list[str]]:
@@ -41,7 +47,13 @@ def adapted(effect: Effect, prepared: PreparedScene) -> tuple[Effect, list[str]]
                 f"visibility {visibility:g} m, {asked.visibility:g} times the distance of the background ({behind:.1f} m); "
                 "--intensity sets another"
             )
-    return replace(effect, adaptation=replace(asked, visibility=None, wind_across=False)), said
+    if asked.air is not None:
+        found = air_before(prepared)
+        more = min(max(asked.air / found, 1.0), MOST)
+        effect = effect.with_legibility(_round(more * effect.appearance.legibility))
+        why = f", {more:.2g} times more than usual: only {found:.1f} m of air lie before what is seen" if more > 1 else ""
+        said += [sentence + why for sentence in legible(effect)]
+    return replace(effect, adaptation=Adaptation()), said
 
 
 def background_distance(prepared: PreparedScene) -> float | None:
@@ -50,7 +62,24 @@ def background_distance(prepared: PreparedScene) -> float | None:
     Args:
         prepared: the scene.
     """
-    cameras = prepared.scene.cameras
+    solid = (seen[torch.isfinite(seen)] for seen in _distances(prepared))
+    found = [float(metres.quantile(BEHIND)) for metres in solid if len(metres)]
+    return float(np.median(found)) if found else None
+
+
+def air_before(prepared: PreparedScene) -> float:
+    """Mean over the pixels of some views of the metres of air before what is seen, of which no more than FAR count: beyond,
+    hardly any flake or drop is told apart.
+
+    Args:
+        prepared: the scene.
+    """
+    return float(torch.cat(_distances(prepared)).clamp_max(FAR).mean())
+
+
+def _distances(prepared: PreparedScene) -> list[Float[Tensor, " n"]]:
+    """Depths in metres of what the pixels of some small pictures show; inf where they show nothing solid."""
+    cameras, metres = prepared.scene.cameras, prepared.scene.frame.metres_per_unit
     chosen = sorted({round(i) for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras)))})
     found = []
     for index in chosen:
@@ -58,10 +87,9 @@ def background_distance(prepared: PreparedScene) -> float | None:
         height = max(2, round(WIDTH * camera.height / camera.width))
         with torch.no_grad():
             picture = prepared.rasterizer.render(camera.resized(WIDTH, height).to(prepared.device), None, None, None)
-        depths = picture.depth[0][picture.accumulation[0] > SOLID]
-        if len(depths):
-            found.append(float(depths.float().quantile(BEHIND)))
-    return None if not found else float(np.median(found)) * prepared.scene.frame.metres_per_unit
+        depths = torch.where(picture.accumulation[0] > SOLID, metres * picture.depth[0].float(), math.inf)
+        found.append(depths.flatten().cpu())
+    return found
 
 
 def _across(prepared: PreparedScene, cameras: Cameras) -> float:

@@ -67,8 +67,7 @@ def _spots(alpha: Float[Tensor, "h w"]) -> int:
 def _thinning(prepared: PreparedScene, path: Cameras, view: Cameras) -> Iterator[Record]:
     """Against a run in which every particle is there and drawn however far away it is."""
     for name, intensity in (("snowfall", 1.5), ("rainfall", 20.0)):
-        kind = effect(name, intensity=intensity)
-        kind = replace(kind, appearance=replace(kind.appearance, legibility=1.0))
+        kind = effect(name, intensity=intensity).with_legibility(1.0)
         full = shown(weather_along(prepared, kind, path, 1, sharpness=1e5, most=ALL), view, 0)
         for most in (100_000, 20_000):
             weather = weather_along(prepared, kind, path, 1, most=most)
