@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from pgsd_nerfstudio.effects import RAINFALL
+from pgsd_nerfstudio.effects import RAINFALL, InitialLook, ParticleLook
+from pgsd_nerfstudio.physics.bodies import DRIPPED, SPLASHED
 from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
 from pgsd_nerfstudio.physics.laws.water_waves import crater_depth, elevation
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import linear
 from pgsd_nerfstudio.rendering.moment import Viewpoint
+from pgsd_nerfstudio.response.crowns import LIVES, crowns_of
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.impacts import Impacts
+from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.response.light import mirrored
 from pgsd_nerfstudio.response.mirrored_scene import MirroredScene
 from pgsd_nerfstudio.response.puddles import Puddles, reflected
@@ -197,6 +201,46 @@ def test_rings_and_crowns_are_drawn_where_the_drop_fell_and_only_while_they_last
     assert (older.means[:, :2] - torch.tensor([0.1, 0.2])).norm(dim=1).median() > away.median() + 0.02
     quiet = replace(DEEP, surface=replace(DEEP.surface, ripples=False, splash=None))
     assert _puddles(quiet).struck_by(_drop()).at(0.15).drawn(_view(), below, 1.0) is None
+
+
+def _crown(age: float, legibility: float = 1.0) -> Gaussians:
+    """Of a drop of 3 mm at 8 m/s."""
+    drop = Impacts(np.array([1.0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.003]), np.array([8.0]))
+    ground, sky = torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([0.5, 0.6, 0.7])
+    return crowns_of(drop, 1.0 + age * LIVES, ground, sky, 0.22, legibility)
+
+
+@pytest.mark.parametrize("age", [0.02, 0.1, 0.5])
+def test_a_crown_is_as_wide_and_high_as_it_is_in_nature(age: float):
+    """Yarin & Weiss (1995) on a film of half a diameter, up to 1.6 diameters."""
+    crown, drop = _crown(age), 0.003
+    radius = (crown.means[:, :2] - torch.tensor([0.1, 0.2])).norm(dim=1)
+    expected = min(drop * (2 / 3) ** 0.25 * np.sqrt(8.0 * age * LIVES / (drop / 2)), 1.6 * drop)
+    assert radius.numpy() == pytest.approx(expected, rel=1e-3)
+    top = crown.means[:, 2] + crown.scales[:, 2]
+    assert top.max() <= 3.1 * drop + 0.002
+    # A jet covers as much as a disc of 0.22 diameters does: 2 pi s^2.
+    assert crown.scales[:, 0].numpy() == pytest.approx(0.36 * 0.22 * drop, rel=1e-5)
+    assert _crown(age, 9.0).scales[:, 0].numpy() == pytest.approx(3 * 0.36 * 0.22 * drop, rel=1e-5)
+    assert torch.equal(_crown(age, 9.0).means, crown.means)
+
+
+def test_the_water_of_a_crown_shows_half_of_the_ground_and_half_of_the_sky():
+    light = linear(_crown(0.3).colors)
+    assert torch.allclose(light, torch.tensor([0.3, 0.4, 0.5]).expand(len(light), 3), atol=1e-4)
+
+
+@pytest.mark.mistyped
+def test_what_drips_is_seen_at_its_own_size_and_what_falls_at_its_legible_one():
+    kinds = torch.tensor([0, SPLASHED, DRIPPED, DRIPPED | SPLASHED], dtype=torch.uint8)
+    history = SimpleNamespace(kinds=kinds, collided=torch.zeros(4, dtype=torch.bool))
+    look = ParticleLook(torch.ones(4), torch.full((4, 3), 0.006), torch.ones(4, 3))
+    appearance = replace(RAINFALL.appearance, legibility=4.0, nearness=2.25)
+    answer = SimpleNamespace(
+        effect=replace(RAINFALL, appearance=appearance), exposure=SimpleNamespace(loose=torch.zeros(1, dtype=torch.bool))
+    )
+    found = in_place(InitialLook(look, look, 0.0), history, answer, _ground(2)).active
+    assert found.scales[:, 0].tolist() == pytest.approx([0.006, 0.006, 0.002, 0.006])
 
 
 def test_a_part_of_the_scene_keeps_its_own_puddles():

@@ -40,16 +40,16 @@ def test_little_air_is_made_up_for_by_area_and_it_is_said(yard, effect):
     assert effect.adaptation.air is not None
     more = float(np.clip(effect.adaptation.air / np.minimum(metres * floor_depths(), FAR).mean(), 1, MOST))
     found, said = adapted(effect, prepared)
-    assert found.appearance.legibility == pytest.approx(more * effect.appearance.legibility, rel=0.06)
+    assert found.appearance.area_factor == pytest.approx(more * effect.appearance.legibility, rel=0.06)
     assert (more > 1) == any("times more than usual" in sentence for sentence in said)
-    assert adapted(found, prepared) == (found, [])
+    assert adapted(found, prepared) == (found, [])  # what was found is not asked for again
 
 
 def test_a_legibility_that_is_asked_for_stays(yard):
     asked, _ = EffectOptions(effect="rainfall", legibility=1.0).resolve()
     found, said = adapted(asked, yard[1])
-    assert found.appearance.legibility == 1.0 and said == []
+    assert found.appearance.area_factor == 1.0 and said == []
 
 
 def test_fog_takes_no_heed_of_it(yard):
-    assert adapted(FOG, yard[1])[0].appearance.legibility == FOG.appearance.legibility
+    assert adapted(FOG, yard[1])[0].appearance == FOG.appearance

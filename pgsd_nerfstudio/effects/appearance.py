@@ -125,7 +125,7 @@ def initial_look(effect: Effect, particles: Particles, *, seed: int = 0) -> Init
     """
     generator = torch.Generator().manual_seed(seed)
     looks, diameters = effect.appearance, particles.diameters.cpu().float()
-    wider = math.sqrt(looks.legibility)
+    wider = math.sqrt(looks.area_factor)
     active = _look(looks.active, wider * _flake_scales(looks.active, diameters), generator)
     if looks.active.opacity is None:
         shadow = particles.represents.cpu() * 0.5 * math.pi * diameters**2  # extinction cross-section, twice the geometric one

@@ -7,6 +7,7 @@ times in seconds, unless a name says otherwise.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from pgsd_nerfstudio.effects.adaptation import Adaptation
@@ -91,15 +92,23 @@ class Appearance:
     exposure: float = 0.0
     """Shutter time in seconds: active particles are smeared by speed times this. 0 freezes them, as is usual for snow; rain and
     sand show streaks at 1/50 s."""
-
     legibility: float = 1.0
     """Factor on the area of all that flies, 1-1000. At 1 it takes as much light as in nature, which can be next to nothing."""
+    nearness: float = 1.0
+    """Another factor on that area, for scenes with little air before their background (`Adaptation.air`)."""
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.legibility <= 1000.0:
             raise ValueError(f"legibility must lie in 1-1000, got {self.legibility:g}; at 1 particles cover what they cover")
         if not 0.0 <= self.exposure <= 1.0:
             raise ValueError(f"exposure must lie in 0-1 s, got {self.exposure:g}; a film camera has about 0.02")
+        if not 1.0 <= self.nearness < math.inf:
+            raise ValueError(f"nearness must be at least 1, got {self.nearness:g}")
+
+    @property
+    def area_factor(self) -> float:
+        """Factor on the area of all that flies, against nature."""
+        return self.legibility * self.nearness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +151,7 @@ class Effect:
             ValueError: the legibility is out of its range.
         """
         fixed = replace(self.adaptation, air=None)
-        return replace(self, appearance=replace(self.appearance, legibility=legibility), adaptation=fixed)
+        return replace(self, appearance=replace(self.appearance, legibility=legibility, nearness=1.0), adaptation=fixed)
 
     def prompt_for(self, description: str) -> str:
         """The prompt for a scene with this description, such as "a garden"."""

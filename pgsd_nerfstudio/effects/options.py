@@ -257,7 +257,7 @@ class EffectOptions:
 
 def legible(effect: Effect) -> list[str]:
     """What is to be said about how much more of a view particles take than in nature; nothing while that follows the scene."""
-    factor = effect.appearance.legibility
+    factor = effect.appearance.area_factor
     if factor == 1 or effect.adaptation.air is not None:
         return []
     return [

@@ -122,11 +122,11 @@ def changed_rows(prepared: PreparedScene, path: Cameras, view: Cameras, instants
         own = effect(name, intensity=intensity)
         for kind in (own, own.with_legibility(1.0)):
             weather, asked = weather_along(prepared, kind, path, instants[-1] + 1), kind is own
-            factor = weather.effect.appearance.legibility
+            look = weather.effect.appearance
             found = 100 * float(np.mean([shown(weather, view, frame).changed for frame in instants]))
             yield Record(
                 f"{name}, {intensity:g} mm/h, {prepared.scene.name}: pixels that flying particles change, "
-                f"{'default ' if asked else ''}legibility {factor:g}",
+                f"{look.area_factor:g} times their area",
                 found,
                 "%",
                 target=f">= {low:g}" if asked else None,

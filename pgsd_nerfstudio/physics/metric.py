@@ -157,7 +157,7 @@ def _sharpness(effect: Effect, cameras: Cameras | None) -> float | None:
     if cameras is None or len(cameras) == 0 or not effect.emission.precipitates:
         return None
     focal = float(cameras.Ks[:, 0, 0].median()) * min(1.0, WIDEST_PICTURE / cameras.width)
-    return math.sqrt(effect.appearance.legibility) * focal / SMALLEST_SEEN
+    return math.sqrt(effect.appearance.area_factor) * focal / SMALLEST_SEEN
 
 
 @contextmanager

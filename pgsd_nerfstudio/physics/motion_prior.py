@@ -65,7 +65,7 @@ def motion_prior(
     max_particles = MAX_PARTICLES if max_particles is None else max_particles
     cameras = None if everything else scene.frame.cameras_to_metric(scene.cameras if path is None else path)
     parts = (effect.emission, effect.material, effect.wind, effect.timeline, effect.surface, effect.dense)
-    parts = (*parts, effect.appearance.legibility)
+    parts = (*parts, effect.appearance.area_factor)
     what = (surface.vertices, surface.triangles, effect.name, *parts, clock, domain, seed, max_particles, cameras)
     key = content_key("motion prior", _REVISION, profile, *what)
     stored, folder = cache_dir() / "motion" / f"{key}.safetensors", cache_dir() / "motion" / key

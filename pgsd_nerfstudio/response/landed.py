@@ -1,4 +1,4 @@
-"""Particles in the light of the weather, and collided ones where they can lie.
+"""Particles in the light of the weather, drips at their own size, and collided ones where they can lie.
 
 Like the cover around them, collided particles are darker under less sky. Where the layer of cover lies they vanish in it, and
 none is shown on what is too steep to hold it, in shelter from what falls, or on shreds of the surface that nothing carries.
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.effects.timeline import Timeline
+from pgsd_nerfstudio.physics.bodies import DRIPPED, SPLASHED
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.answer import Answer
@@ -42,7 +43,7 @@ def in_place(look: InitialLook, history: ParticleHistory, answer: Answer, metric
         answer: tells which share of the sky each frozen Gaussian sees, and where the layer lies.
         metric: the Gaussians of `answer` in metres.
     """
-    look = _under_clouds(look, answer)
+    look = _drips(_under_clouds(look, answer), history, answer)
     known = (~answer.exposure.loose).nonzero()[:, 0].cpu()
     collided = history.collided.nonzero()[:, 0].cpu()
     if answer.effect.surface.landing != "stays" or len(known) == 0 or len(collided) == 0:
@@ -75,6 +76,15 @@ def _under_clouds(look: InitialLook, answer: Answer) -> InitialLook:
     white = own.amax(1, keepdim=True).median().clamp_min(SNOW)  # ash and leaves are darker than snow and stay so
     light = AGAINST_SKY * linear(torch.tensor(answer.effect.haze.rgb if answer.effect.haze else ambience.sky).to(own))
     return replace(look, active=replace(look.active, rgb=encoded(own / white * light).clamp_max(1.0)))
+
+
+def _drips(look: InitialLook, history: ParticleHistory, answer: Answer) -> InitialLook:
+    """Drops that come loose from an edge are slow, large and round: they are drawn at their own size at any legibility."""
+    if answer.effect.surface.landing != "wets":
+        return look
+    dripped = ((history.kinds & DRIPPED) > 0) & ((history.kinds & SPLASHED) == 0)
+    scales = torch.where(dripped[:, None], look.active.scales / answer.effect.appearance.area_factor**0.5, look.active.scales)
+    return replace(look, active=replace(look.active, scales=scales))
 
 
 def _held(quats: Float[Tensor, "n 4"], answer: Answer) -> Float[Tensor, " n"]:

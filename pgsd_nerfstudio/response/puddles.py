@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,14 +25,13 @@ from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.moment import Viewpoint
 from pgsd_nerfstudio.response.coating import falling_mass, rained
-from pgsd_nerfstudio.response.crowns import crowns_of
+from pgsd_nerfstudio.response.crowns import crowned, crowns_of
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.impacts import Impacts
 from pgsd_nerfstudio.response.light import leafy, mirrored
 from pgsd_nerfstudio.response.mirrored_scene import MirroredScene
 from pgsd_nerfstudio.response.ring_arcs import arcs_of
 from pgsd_nerfstudio.response.ripples import Ripples, tilted
-from pgsd_nerfstudio.response.sky import overcast
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
@@ -163,6 +163,11 @@ class Puddles:
             return self.scene.seen(points, directions, ambience, weather)
         return linear(torch.tensor((ambience or Ambience()).sky)).to(points).expand(len(points), 3)
 
+    @cached_property
+    def nearest(self) -> KDTree:
+        """Of all Gaussians, in metres."""
+        return KDTree(self.points.numpy(force=True))
+
     @property
     def rippling(self) -> bool:
         """Whether drops make rings."""
@@ -240,10 +245,7 @@ class PuddlesNow:
         puddles = self.puddles
         one = Cameras(view.viewmat.cpu().float()[None], view.K.cpu().float()[None], view.width, view.height)
         camera = puddles.frame.cameras_to_metric(one)
-        parts = [self._rings(camera, below, weather)]
-        if puddles.impacts is not None and puddles.effect.surface.splash is not None:
-            white = overcast(torch.ones(1), (puddles.effect.ambience or Ambience()).sky)[0]
-            parts.append(crowns_of(puddles.impacts, self.seconds, camera, encoded(white), puddles.effect.appearance.legibility))
+        parts = [self._rings(camera, below, weather), self._crowns(camera, below)]
         found = [part for part in parts if part is not None and len(part)]
         return puddles.frame.gaussians_to_scene(concatenate(found)).to(view.viewmat.device) if found else None
 
@@ -271,6 +273,17 @@ class PuddlesNow:
         ground = linear(below(torch.from_numpy(puddles.bottom_ids[nearest[kept]])).cpu())
         light = (1 - fresnel)[:, None] * ground + fresnel[:, None] * seen
         return arcs.gaussians(points + TOWARDS * towards, torch.from_numpy(share).float(), encoded(light))
+
+    def _crowns(self, camera: Cameras, below: Below) -> Gaussians | None:
+        """The crowns near a camera in metres."""
+        puddles, splash = self.puddles, self.puddles.effect.surface.splash
+        if puddles.impacts is None or splash is None:
+            return None
+        young = crowned(puddles.impacts, self.seconds, camera)
+        _, struck = puddles.nearest.query(young.places)
+        ground = linear(below(torch.from_numpy(struck).to(puddles.points.device)).cpu())
+        sky = linear(torch.tensor((puddles.effect.ambience or Ambience()).sky))
+        return crowns_of(young, self.seconds, ground, sky, splash.diameter, puddles.effect.appearance.legibility)
 
 
 Below = Callable[[Int[Tensor, " k"]], Float[Tensor, "k 3"]]

@@ -23,7 +23,7 @@ WIDTH = 96  # pixels
 BEHIND = 0.7  # share of a picture that is nearer than its background
 SOLID = 0.5  # accumulation from which a pixel shows something
 FAR = 12.0  # m; rain's particles are drawn up to about here
-MOST = 4.0  # times the legibility of the effect
+MOST = 4.0  # nearness
 
 
 def adapted(effect: Effect, prepared: PreparedScene) -> tuple[Effect, list[str]]:
@@ -49,9 +49,9 @@ def adapted(effect: Effect, prepared: PreparedScene) -> tuple[Effect, list[str]]
             )
     if asked.air is not None:
         found = air_before(prepared)
-        more = min(max(asked.air / found, 1.0), MOST)
-        effect = effect.with_legibility(_round(more * effect.appearance.legibility))
-        why = f", {more:.2g} times more than usual: only {found:.1f} m of air lie before what is seen" if more > 1 else ""
+        more = _round(min(max(asked.air / found, 1.0), MOST))
+        effect = replace(effect, appearance=replace(effect.appearance, nearness=more), adaptation=Adaptation())
+        why = f", {more:g} times more than usual: only {found:.1f} m of air lie before what is seen" if more > 1 else ""
         said += [sentence + why for sentence in legible(effect)]
     return replace(effect, adaptation=Adaptation()), said
 
