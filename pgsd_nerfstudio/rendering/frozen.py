@@ -18,13 +18,13 @@ import torch
 
 from pgsd_nerfstudio.rendering.binning import Binned, bin_splats, keep_entries, visible_by_depth
 from pgsd_nerfstudio.rendering.blending import blend_frozen
+from pgsd_nerfstudio.rendering.harmonics import color
 from pgsd_nerfstudio.rendering.layers import Layers, press
 from pgsd_nerfstudio.rendering.moment import Moment, Viewpoint
 from pgsd_nerfstudio.rendering.projection import BLUE, COLUMNS, RED, Lens, lens, project
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
 from pgsd_nerfstudio.rendering.view_cache import ViewCache
 from pgsd_nerfstudio.scene.gaussians import Gaussians
-from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
 
 
 class View(NamedTuple):
@@ -87,15 +87,13 @@ def splat(gaussians: Gaussians, view: View, shade: Shade | None = None) -> tuple
         view.lens,
         splats,
     )
+    color(float_array(gaussians.colors), float_array(gaussians.means), view.viewmat, splats)
     ids = visible_by_depth(splats)
     visible = np.take(splats, ids, axis=0)  # several times faster than an index of rows
-    if gaussians.colors.ndim == 2 and shade is None:
-        visible[:, RED : BLUE + 1] = np.take(float_array(gaussians.colors), ids, axis=0)
-    else:
+    if shade is not None:
         seen = torch.from_numpy(ids).long()
-        colors, means = gaussians.colors.detach()[seen], gaussians.means.detach()[seen]
-        seen_colors = view_colors(colors, means, torch.from_numpy(view.viewmat))
-        visible[:, RED : BLUE + 1] = (seen_colors if shade is None else shade(seen_colors, means, seen)).numpy()
+        unshaded = torch.from_numpy(np.ascontiguousarray(visible[:, RED : BLUE + 1]))
+        visible[:, RED : BLUE + 1] = shade(unshaded, gaussians.means.detach()[seen], seen).numpy()
     return bin_splats(visible, view.lens.width, view.lens.height), ids
 
 

@@ -266,11 +266,11 @@ class Shown:
         total = len(self.hidden)
         if self.answer.layer is None or self.pieces is None:
             return self._scene_light(light, ids, towards)
-        own, found = ids < total, torch.empty_like(light)
-        found[own] = self._scene_light(light[own], ids[own], None if towards is None else towards[own])
-        lying = self.answer.layer.light(self.pieces[0], self.answer.effect.appearance.collided.rgb)
-        found[~own] = lying[ids[~own] - total].to(light)
-        return found
+        own, lying = ((ids < total).nonzero()[:, 0], (ids >= total).nonzero()[:, 0])  # faster than two masks
+        scene = self._scene_light(light[own], ids[own], None if towards is None else towards[own])
+        layer = self.answer.layer.light(self.pieces[0], self.answer.effect.appearance.collided.rgb)
+        found = torch.empty_like(light).index_copy_(0, own, scene)
+        return found.index_copy_(0, lying, layer[ids[lying] - total].to(light))
 
     def _scene_light(self, light: Float[Tensor, "m 3"], ids: Int[Tensor, " m"], towards: Float[Tensor, "m 3"] | None) -> Tensor:
         effect, exposure, edited = self.answer.effect, self.answer.exposure, self.answer.edits is not None

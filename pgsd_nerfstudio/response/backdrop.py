@@ -56,16 +56,19 @@ def behind_gaps(
     height = (rays @ up.T.to(rays))[:, 2]
     low, high = OPEN
     opened = ((gaps.light[seen] - low) / (high - low)).clamp(0, 1)
-    opened = (opened * opened * (3 - 2 * opened))[:, None].to(own)
-    near = linear(own).expand(len(rays), 3)
-    sky = near
-    if effect.ambience is not None:
-        sky = torch.lerp(near, overcast(height, effect.ambience.sky), share * effect.ambience.clouds)
+    opened = (opened * opened * (3 - 2 * opened)).to(own)
+    light = linear(own).expand(len(rays), 3)
     if medium is not None:
         units = gaps.depth[seen].to(own) * local.norm(dim=1)
         way = medium.optical_depth(view.center + units[:, None] * rays, *view)
-        near = medium.mixed(near, thinned(way, units * metres_per_unit, effect)[:, None])
-        far = view.center + (reach(height) / metres_per_unit)[:, None] * rays
+        light = medium.mixed(light, thinned(way, units * metres_per_unit, effect)[:, None])
+    into = (opened > 0).nonzero()[:, 0]
+    sky, height = linear(own).expand(len(into), 3), height[into]
+    if effect.ambience is not None:
+        sky = torch.lerp(sky, overcast(height, effect.ambience.sky), share * effect.ambience.clouds)
+    if medium is not None:
+        far = view.center + (reach(height) / metres_per_unit)[:, None] * rays[into]
         sky = medium.mixed(sky, medium.optical_depth(far, *view)[:, None])
-    found[seen] = encoded(torch.lerp(near, sky, opened))
+    light = light.index_copy(0, into, torch.lerp(light[into], sky, opened[into, None]))
+    found[y, x] = encoded(light)
     return found

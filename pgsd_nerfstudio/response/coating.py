@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.integrate import trapezoid
 from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
@@ -117,7 +116,7 @@ def rained(effect: Effect, seconds: float) -> float:
     until = min(max(seconds, 0.0), timeline.ends)
     at = np.linspace(0.0, until, max(math.ceil(until * STEPS_PER_SECOND), 1) + 1)
     coming = np.array([timeline.share(t) for t in at])
-    return float(trapezoid(coming * np.exp((at - seconds) / tau), at))
+    return integral(coming * np.exp((at - seconds) / tau), at)
 
 
 def _uneven(metric: Float[Tensor, "n 3"], seed: int) -> Float[Tensor, " n"]:

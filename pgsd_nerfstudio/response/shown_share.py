@@ -9,7 +9,9 @@ changes no mean.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,7 +31,7 @@ class ShownShare:
     """Lengths of hazy air before distances from a camera."""
 
     distances: Float[ndarray, " d"]
-    """Metres, ascending from 0."""
+    """Metres: 0, then ascending by the same factor."""
     lengths: Float[ndarray, " d"]
     """Metres of full haze before each distance."""
 
@@ -52,10 +54,18 @@ class ShownShare:
         lengths = np.concatenate([[0.0], np.cumsum(0.5 * (left[1:] + left[:-1]) * np.diff(DISTANCES))])
         return ShownShare(DISTANCES, lengths)
 
+    @cached_property
+    def _pieces(self) -> tuple[Float[ndarray, " d"], Float[ndarray, " d"]]:
+        """Value at zero and slope of the straight piece that begins at each distance; after the last one all air counts."""
+        slopes = np.concatenate([np.diff(self.lengths) / np.diff(self.distances), [1.0]])
+        return self.lengths - slopes * self.distances, slopes
+
     def before(self, distances: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Metres of full haze before distances in metres; beyond the last one all air counts."""
-        at, lengths = (torch.from_numpy(values).to(distances) for values in (self.distances, self.lengths))
-        upper = torch.searchsorted(at, distances.detach().contiguous()).clamp(1, len(at) - 1)
-        share = (distances - at[upper - 1]) / (at[upper] - at[upper - 1])
-        within = torch.lerp(lengths[upper - 1], lengths[upper], share.clamp(0.0, 1.0))
-        return within + (distances - at[-1]).clamp_min(0.0)
+        values, slopes = (torch.from_numpy(numbers).to(distances) for numbers in self._pieces)
+        # Distances after the first grow by one factor, so that the piece of a distance follows from its logarithm.
+        nearest, farthest, pieces = float(self.distances[1]), float(self.distances[-1]), len(slopes) - 2
+        per_logarithm = pieces / math.log(farthest / nearest)
+        slots = (distances.detach().clamp_min(1e-30) / nearest).log() * per_logarithm
+        piece = (slots.floor() + 1).clamp(0, pieces + 1).long()
+        return values[piece] + slopes[piece] * distances

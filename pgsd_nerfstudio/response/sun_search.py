@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -173,6 +172,8 @@ def fitted(samples: Samples, cosines: Float[Tensor, " n"], *, width: float, stro
         width: of the bounded loss.
         strongest: greatest ratio; 0 for a sky without a sun.
     """
+    from scipy.optimize import least_squares  # a tenth of a second to import, and an answer is kept
+
     closed = 1 - samples.sky
     shares = torch.cat([cosines[:, None], closed[:, None], samples.slope], dim=1)
 

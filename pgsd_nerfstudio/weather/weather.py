@@ -56,8 +56,8 @@ class Weather:
         """What is shown of the motion: what is trained, or the simulated motion and the initial look, bit for bit."""
         if self.trained is not None:
             return self.trained
-        # A field that has learned nothing adds nothing.
-        field = DynamicsField.for_history(self.history)
+        # A field that has learned nothing adds nothing, whatever its box and its speed.
+        field = DynamicsField(torch.zeros(2, 3), 1.0, self.frame_count).to(self.history.device)
         shown = self.effect.appearance
         return Rollout(self.history, self.look, field, exposure=shown.exposure, sparkle=Sparkle.of(shown.active))
 

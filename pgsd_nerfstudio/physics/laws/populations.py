@@ -7,7 +7,6 @@ import math
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.integrate import cumulative_trapezoid
 
 from pgsd_nerfstudio.effects import snowfall
 from pgsd_nerfstudio.effects.matter import CONTRASTS, Emission, Material
@@ -99,4 +98,4 @@ def cumulative(density: Float[ndarray, " d"], at: Float[ndarray, " d"]) -> Float
         density: values.
         at: ascending abscissas of the values.
     """
-    return cumulative_trapezoid(density, at, initial=0.0)
+    return np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(at))])
