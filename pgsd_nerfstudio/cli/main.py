@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 could not (one sentence on stderr), 2 wrong usage, or a fi
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -59,7 +60,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def main() -> None:
     """Entry point of the `pgsd` command."""
-    sys.exit(run())
+    try:
+        code = run()
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader has seen enough, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+        code = 1
+    sys.exit(code)
 
 
 if __name__ == "__main__":
