@@ -196,7 +196,9 @@ def test_nothing_is_said_before_a_command_begins():
 
 def test_a_reader_that_has_seen_enough_is_no_error():
     program = "import pgsd_nerfstudio.cli.main as door; door.run = lambda: print('row\\n' * 100_000); door.main()"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline() == "row\n"
         process.stdout.close()
