@@ -26,12 +26,12 @@ from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws import populations
 from pgsd_nerfstudio.rendering.medium import Froxels, Lengths, Medium
+from pgsd_nerfstudio.response.front import Front, smooth_step
 from pgsd_nerfstudio.response.patches import Patches
 from pgsd_nerfstudio.response.shown_share import ShownShare
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.storage import content_key
 
-WALL = 5.0  # m; a front rises over this from clear air to full weather
 FADE_IN = 0.2  # share of the onset in which a front becomes visible
 EDGE = 1.0  # m; over this the parcels of fog take over from the haze
 FIRST_SLICE = 0.4  # m
@@ -67,40 +67,6 @@ def areas_in_air(effect: Effect) -> tuple[Float[ndarray, " a"], Float[ndarray, "
 def flake_area(diameters: Float[ndarray, " a"]) -> Float[ndarray, " a"]:
     """Area in m^2 of aggregates with diameters in metres (Mitchell 1996, table 1)."""
     return 1e-4 * 0.2285 * (1e2 * diameters) ** 1.88
-
-
-@dataclass(frozen=True, kw_only=True)
-class Front:
-    """A wall of weather that the wind carries over the ground, with clear air before it and full weather behind it."""
-
-    along: tuple[float, float]
-    """Unit vector of its motion, horizontal, in the metric frame."""
-    start: float
-    """Position at second 0, in metres along its motion."""
-    speed: float
-    """Speed in m/s."""
-
-    @staticmethod
-    def of(arrival: Arrival) -> Front:
-        """The front of the particles, which starts at the upwind corner of the domain.
-
-        Raises:
-            ValueError: the particles do not arrive as a front.
-        """
-        if not arrival.is_front:
-            raise ValueError(f"only what arrives as a front within an onset has one, found {arrival.timeline}")
-        start = arrival.front_position(0.0)
-        x, y = arrival.along.tolist()
-        return Front(along=(x, y), start=start, speed=arrival.front_position(1.0) - start)
-
-    def passed(self, points: Float[Tensor, "n 3"], seconds: float) -> Float[Tensor, " n"]:
-        """Share of the full weather at metric points at a second, 0..1."""
-        behind = self.start + self.speed * seconds - points[:, 0] * self.along[0] - points[:, 1] * self.along[1]
-        return _smooth_step(behind / WALL + 0.5)
-
-    def left(self, domain: Domain, seconds: float) -> float:
-        """Distance in metres of the whole wall behind the domain at a second; negative until it has passed."""
-        return self.start + self.speed * seconds - WALL / 2 - _extent(domain, self.along)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -141,12 +107,12 @@ class HazeField:
         haze, wind, timeline = effect.haze, effect.wind, effect.timeline
         extinction = full_extinction(effect)
         arrival = Arrival.of(timeline, domain, wind)
-        front, patches = Front.of(arrival) if arrival.is_front else None, None
+        front, patches = Front.of(arrival, domain, seed) if arrival.is_front else None, None
         if haze is not None and haze.patchiness > 0:
             angle = math.radians(wind.direction_degrees)
             drift = wind.speed * math.cos(angle), wind.speed * math.sin(angle), 0.0
             patches = Patches.draw(haze.patchiness, haze.patch_size, drift, turbulence=wind.turbulence, seed=seed)
-        made_from = haze, effect.emission, effect.material, effect.wind, effect.appearance, timeline, domain, front, seed
+        made_from = haze, effect.emission, effect.material, effect.wind, effect.appearance, timeline, domain, seed
         return HazeField(
             airlight=(0.0, 0.0, 0.0) if haze is None else haze.rgb,
             extinction=extinction,
@@ -220,7 +186,7 @@ class HazeField:
 
     def _is_even(self, seconds: float) -> bool:
         """Whether the haze is the same everywhere within sight."""
-        gone = self.front is None or self.front.left(self.domain, seconds) > self._reach
+        gone = self.front is None or self.front.left(self.domain, seconds, self._reach)
         return gone and self.patches is None and math.isinf(self.scale_height) and self.parcels == 0.0
 
     @property
@@ -250,22 +216,7 @@ class HazeField:
         )
 
 
-def _extent(domain: Domain, along: tuple[float, float]) -> tuple[float, float]:
-    """Least and greatest coordinate of a domain along a horizontal direction."""
-    ends = [
-        [min(a * low, a * high), max(a * low, a * high)]
-        for a, low, high in zip(along, domain.lower[:2], domain.upper[:2], strict=True)
-    ]
-    return ends[0][0] + ends[1][0], ends[0][1] + ends[1][1]
-
-
 def _inside(domain: Domain, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """1 inside the domain and 0 outside, with a soft edge centred on the faces, so that no extinction is counted twice."""
     lower, upper = torch.tensor(domain.lower).to(points), torch.tensor(domain.upper).to(points)
-    return (_smooth_step((points - lower) / EDGE + 0.5) * _smooth_step((upper - points) / EDGE + 0.5)).prod(dim=1)
-
-
-def _smooth_step(x: Tensor) -> Tensor:
-    """A cubic from 0 at 0 to 1 at 1 that is level at both ends."""
-    x = x.clamp(0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
+    return (smooth_step((points - lower) / EDGE + 0.5) * smooth_step((upper - points) / EDGE + 0.5)).prod(dim=1)
