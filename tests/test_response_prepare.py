@@ -57,7 +57,7 @@ def test_what_rays_know_nothing_of_needs_no_new_rays(scene, floor, monkeypatch):
 def test_a_stored_answer_is_the_same_with_its_edits_and_softening(scene, floor, tmp_path):
     n = len(scene.gaussians)
     edits = Edits(torch.rand(n, 3), torch.rand(n), torch.rand(n, 3))
-    made = replace(answer_of(scene, floor, effect("rainfall"), seconds=5.0, edits=edits), softening=torch.rand(n))
+    made = replace(answer_of(scene, floor, effect("rainfall"), seconds=5.0, edits=edits), softening=torch.rand(n, 3))
     save_answer(tmp_path / "a.safetensors", made)
     found = stored_answer(tmp_path / "a.safetensors", scene, effect("rainfall"), seconds=5.0)
     assert found is not None and same(found, made)
@@ -79,11 +79,12 @@ def test_without_clouds_or_sun_nothing_softens(scene, floor, monkeypatch):
     metric = to_metric(scene)
     snow = effect("snowfall")
     exposure = Exposure.of(metric, floor, snow)
+    none_is_sky = torch.zeros(len(metric))
     monkeypatch.setattr(prepare, "find_sunlight", lambda *_: None)
-    assert softening_of(metric, exposure, floor, snow) is None
+    assert softening_of(metric, exposure, floor, snow, none_is_sky) is None
     monkeypatch.setattr(prepare, "find_sunlight", lambda *_: Sunlight((0.0, 0.6, 0.8), 4.0, 0.2, 0.1, 9.0))
-    assert softening_of(metric, exposure, floor, replace(snow, ambience=None)) is None
-    softened = softening_of(metric, exposure, floor, snow)
+    assert softening_of(metric, exposure, floor, replace(snow, ambience=None), none_is_sky) is None
+    softened = softening_of(metric, exposure, floor, snow, none_is_sky)
     assert softened is not None and (softened > 0).all()
     # The open floor keeps its light; what the table shades there gains, since clouds shine from all sides.
     open_floor = (exposure.normals[:, 2] > 0.9) & (exposure.sky > 0.99) & ~exposure.loose

@@ -54,8 +54,8 @@ class Answer:
     effect: Effect
     exposure: Exposure
     coating: Coating
-    softening: Float[Tensor, " n"] | None
-    """Factor on linear light in full weather, when clouds soften the shadows; None if no sun was found."""
+    softening: Float[Tensor, "n 3"] | None
+    """Factors on linear red, green and blue in full weather, when clouds take the sun; None if no sun was found."""
     up: Float[Tensor, "3 3"]
     """Scene axes to metric axes."""
     metres_per_unit: float

@@ -6,8 +6,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
-from scipy.spatial import KDTree
+from jaxtyping import Float
 from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
@@ -24,6 +23,7 @@ from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.layer_making import layer_of
 from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.puddle_making import puddles_of, stored_water, water_of
+from pgsd_nerfstudio.response.shadow_borders import Shade, plausible, seen_by_colors, sun_colors
 from pgsd_nerfstudio.response.sky import sky_share
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
 from pgsd_nerfstudio.scene.frame import attention
@@ -34,11 +34,8 @@ from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_t
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
-NEIGHBOURS = 64  # Gaussians over which the softening of shadows is averaged, as wide as shadows of the mesh are off
-MOST_SOFTENING = 5.0  # greatest factor; shadows hold noise and bounced light, which would be too bright with more
-SUNNY = 1.2  # factor below which the sun shone on a Gaussian
-FLATNESS, STEEPEST_EDGE = 0.1, 1.5  # variance of log luminance that counts as flat; change of log factor per log luminance
-_REVISION = 7  # of the computation; stored answers of another revision are not used
+MOST_SOFTENING = 8.0  # greatest factor and, inverse, least; shadows hold noise, which would be too bright with more
+_REVISION = 8  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -66,9 +63,10 @@ def answer_of(
     if answer is None:
         metric = to_metric(scene)
         exposure = Exposure.of(metric, surface, effect, seed=seed)
-        softening = softening_of(metric, exposure, surface, effect)
+        sky = sky_of(scene, metric)
+        softening = softening_of(metric, exposure, surface, effect, sky)
         layer = layer_of(scene, metric, surface, effect, seed=seed)
-        water = water_of(scene, metric, surface, effect, sky_of(scene, metric), seed=seed)
+        water = water_of(scene, metric, surface, effect, sky, seed=seed)
         answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed, layer=layer, water=water)
         save_answer(path, answer)
     return replace(answer, edits=edits)
@@ -136,7 +134,7 @@ def composed(
     scene: Scene,
     effect: Effect,
     exposure: Exposure,
-    softening: Float[Tensor, " n"] | None = None,
+    softening: Float[Tensor, "n 3"] | None = None,
     *,
     seconds: float = 10.0,
     seed: int = 0,
@@ -150,7 +148,7 @@ def composed(
         scene: the frozen scene.
         effect: the weather.
         exposure: of the frozen Gaussians.
-        softening: factor on linear light in full weather; None: no sun was found.
+        softening: factors on linear red, green and blue in full weather; None: no sun was found.
         seconds: second at which the edits are reached in full.
         seed: of patches and the variation of the cover.
         edits: change by edited pictures.
@@ -219,14 +217,17 @@ def to_metric(scene: Scene) -> Gaussians:
     return scene.frame.gaussians_to_metric(replace(frozen, colors=plain))
 
 
-def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect) -> Float[Tensor, " n"] | None:
-    """Factor on linear light in full weather, when the clouds of the ambience soften the shadows of the sun.
+def softening_of(
+    metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect, sky: Float[Tensor, " n"]
+) -> Float[Tensor, "n 3"] | None:
+    """Factors on linear red, green and blue in full weather, when the clouds of the ambience take the sun.
 
     Args:
         metric: the frozen Gaussians in metres, with plain RGB.
         exposure: of these Gaussians.
         surface: mesh of the scene in metres.
         effect: its ambience gives the clouds.
+        sky: share of each Gaussian that is sky, which no sun shines on.
 
     Returns:
         None if the effect has no clouds or no sun was found.
@@ -236,34 +237,15 @@ def softening_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, ef
     sun = sun_of(metric, exposure, surface)
     if sun is None:
         return None
-    seen = lit(sun, metric.means, exposure.normals, surface)
-    factor = overcast_factor(sun, seen, exposure.sky, effect.ambience.clouds).clamp(1 / MOST_SOFTENING, MOST_SOFTENING)
-    _, around = KDTree(metric.means.numpy()).query(metric.means.numpy(), min(NEIGHBOURS, len(factor)))
-    around = torch.from_numpy(around).reshape(len(factor), -1)
-    light = luminance(linear(metric.colors)).clamp_min(1e-3)
-    found = _along_edges(factor.log(), light.log(), around).exp()
-    # Beside a shadow nothing gets brighter than what the sun shone on there.
-    sunny = torch.where(found[around] < SUNNY, (light * found)[around], 0.0).amax(1)
-    return torch.where((sunny > 0) & (found > SUNNY), torch.minimum(found, (sunny / light).clamp_min(1.0)), found)
-
-
-def _along_edges(values: Float[Tensor, " n"], guide: Float[Tensor, " n"], around: Int[Tensor, "n k"]) -> Float[Tensor, " n"]:
-    """Values averaged over neighbours, with the edges of a guide (He, Sun & Tang, "Guided image filtering", 2010, eq. 5-8).
-
-    Shadows of the mesh are some centimetres off those of the picture; the edges are taken where the colours have them. What is
-    brighter than its neighbours never gets a higher value than they for it.
-
-    Args:
-        values: logarithm of a factor.
-        guide: logarithm of the luminance.
-        around: indices of the neighbours.
-    """
-    near, light = values[around], guide[around]
-    mean, middle = near.mean(1), light.mean(1)
-    joint = ((near - mean[:, None]) * (light - middle[:, None])).mean(1)
-    slope = (joint / (light.var(1, unbiased=False) + FLATNESS)).clamp(-STEEPEST_EDGE, 0.0)
-    most = values.abs().amax()
-    return (mean + slope * (guide - middle)).clamp(-most, most)
+    light, solid = linear(metric.colors), metric.opacities > SOLID
+    by_mesh = lit(sun, metric.means, exposure.normals, surface)
+    shade = Shade.of(sun, metric.means, exposure.normals, light, by_mesh, exposure.sky, solid)
+    ratios = sun_colors(shade, ~exposure.loose & (exposure.level > LEVEL), sun)
+    share = seen_by_colors(shade, ratios)
+    clouds, seen = effect.ambience.clouds, shade.cosines * share
+    factors = [overcast_factor(replace(sun, ratio=ratio), seen, exposure.sky, clouds) for ratio in ratios.tolist()]
+    found = torch.stack(factors, dim=1) * plausible(shade, ratios, share)[:, None] ** clouds
+    return torch.lerp(found.clamp(1 / MOST_SOFTENING, MOST_SOFTENING), torch.ones(3), sky[:, None])
 
 
 def sun_of(metric: Gaussians, exposure: Exposure, surface: SurfaceMesh) -> Sunlight | None:

@@ -24,12 +24,13 @@ from pgsd_nerfstudio.response.sunlight import Sunlight
 TURN = 0.1  # m that a difference of 1 between unit normals counts as
 AROUND, WIDTH = 24, 0.15  # neighbours whose costs are averaged, and the distance in metres at which they count 1/e
 AGREE = 0.1  # greatest difference between the shares of a Gaussian and its neighbours for the mesh to be sure of its shadow
-REFERENCES, REACH = 24, 0.5  # sure neighbours whose albedos are compared, and the distance in metres at which they count 1/e
-THINNED = 8  # one of this many sure Gaussians is a reference: they reach beyond what the mesh takes for shade by mistake
+REFERENCES, REACH = 24, 1.0  # sure neighbours whose albedos are compared, and the distance in metres at which they count 1/e
+THINNED = 32  # one of this many sure Gaussians is a reference: they reach beyond what the mesh takes for shade by mistake
 ALBEDO = 0.3  # standard deviation of the kernel, in log light
-STRANGE = 0.02  # likelihood of an albedo that no neighbour has
+ANYWHERE = 3.0  # weight of albedos of the whole scene, beside that of 1 of neighbours
+STRANGE = 0.005  # likelihood of an albedo that nothing has
 LIKE_COLOR = 0.5  # difference of log light at which a neighbour's cost counts 1/e
-SURE, UNSURE = 4.0, 0.5  # cost of leaving the mesh's share by 1, where it is sure and where it is not
+SURE, UNSURE = 3.0, 0.5  # cost of leaving the mesh's share by 1, where it is sure and where it is not
 SHARP = 4.0  # factor on the costs in the softmax
 CERTAIN = 0.95  # probability of full sun or full shade from which a Gaussian serves the others as a reference
 ROUNDS, CHOICES = 2, 5
@@ -40,6 +41,7 @@ ACROSS, PARTNERS, ALIKE = 0.4, 8, 0.9  # m between the sides of a border, partne
 MODES = (1.0, 0.6, 0.4, 0.3, 0.3, 0.3)  # widths of the loss in log ratio, by which the mode is closed in upon
 FARTHEST = 3.0  # greatest factor between the ratio of a channel and that of the luminance
 DARKEST = 1e-3  # linear light
+BOXES = 81  # of the histogram of all albedos, in each channel
 CHUNK = 50_000  # Gaussians at a time, which bounds the memory
 
 
@@ -172,7 +174,8 @@ def seen_by_colors(shade: Shade, ratios: Float[Tensor, "3"]) -> Float[Tensor, " 
     for _ in range(ROUNDS):
         if int(known.sum()) < FEWEST:
             return share
-        costs = leaving - (_likelihoods(shade, shade.albedos(ratios, share), logs, _references(known)) + STRANGE).log()
+        likely = _likelihoods(shade, shade.albedos(ratios, share), logs, known)
+        costs = leaving - (likely + STRANGE).log()
         probable = torch.softmax(-SHARP * _averaged(shade, costs), dim=1)
         share = torch.where(shade.facing, probable @ choices, shade.seen)
         known = shade.facing & shade.solid & (torch.maximum(probable[:, 0], probable[:, -1]) > CERTAIN)
@@ -206,24 +209,40 @@ def _references(known: Bool[Tensor, " n"]) -> Int[Tensor, " m"]:
 
 
 def _likelihoods(
-    shade: Shade, albedos: Float[Tensor, "n 3"], logs: Float[Tensor, "n c 3"], among: Int[Tensor, " m"]
+    shade: Shade, albedos: Float[Tensor, "n 3"], logs: Float[Tensor, "n c 3"], known: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n c"]:
-    """Density of the references' albedos at the albedo that each choice of light asks for; 1 if all have just that one.
+    """How many references around a Gaussian, and anywhere, have the albedo that each choice of light asks for.
+
+    Where the mesh is wrong over a wide area, the references around are wrong too, but few others have such an albedo.
 
     Args:
         shade: of the scene.
         albedos: logarithms, of all Gaussians as they are known so far.
         logs: logarithm of the light for each choice.
-        among: indices of the references.
+        known: Gaussians whose shade is known.
     """
-    distance, near = shade.nearest(REFERENCES + 1, among)
+    distance, near = shade.nearest(REFERENCES + 1, _references(known))
     weights = torch.exp(-distance / REACH) * (near != torch.arange(len(near))[:, None]) + 1e-9
+    frequencies = _frequencies(albedos[shade.facing & shade.solid])
     found = []
     for part in torch.arange(len(near)).split(CHUNK):
         asked = shade.light[part, None] - logs[part]
-        apart = (asked[:, :, None] - albedos[near[part], :][:, None]).square().sum(3)
-        found.append((torch.exp(-apart / (2 * ALBEDO**2)) * weights[part, None]).sum(2))
-    return torch.cat(found) / weights.sum(1, keepdim=True)
+        apart = (asked[:, :, None] - albedos[near[part]][:, None]).square().sum(3)
+        density = (torch.exp(-apart / (2 * ALBEDO**2)) * weights[part, None]).sum(2) / weights[part].sum(1, keepdim=True)
+        found.append(density + ANYWHERE * frequencies[_boxes(asked)])
+    return torch.cat(found)
+
+
+def _frequencies(albedos: Float[Tensor, "m 3"]) -> Float[Tensor, " boxes"]:
+    """Share of all albedos in each box of the kernel's size and those around it, a third of it: about a density of kernels."""
+    counts = torch.bincount(_boxes(albedos), minlength=BOXES**3).float() / len(albedos)
+    return 9 * torch.nn.functional.avg_pool3d(counts.view(1, 1, BOXES, BOXES, BOXES), 3, 1, 1).flatten()
+
+
+def _boxes(albedos: Float[Tensor, "*n 3"]) -> Int[Tensor, "*n"]:
+    """Index of the box of each logarithm of an albedo."""
+    red, green, blue = ((albedos / ALBEDO).round().long() + BOXES // 2).clamp(0, BOXES - 1).unbind(-1)
+    return (red * BOXES + green) * BOXES + blue
 
 
 def _averaged(shade: Shade, costs: Float[Tensor, "n c"]) -> Float[Tensor, "n c"]:
