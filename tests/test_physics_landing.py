@@ -52,7 +52,7 @@ def test_no_path_passes_the_surface():
     expected = (hits.distance <= 1.0).numpy()
     assert expected.sum() > 200
     assert np.setxor1d(met.which, expected.nonzero()[0]).size <= 1  # a path that ends on the surface to the last bit
-    assert len(there.clearance.near(start, stop)) < 0.25 * len(start)
+    assert len(there.cells.clearance.near(start, stop)) < 0.25 * len(start)
 
 
 def test_paths_end_on_the_surface():

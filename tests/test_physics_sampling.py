@@ -65,7 +65,7 @@ def test_every_point_of_a_triangle_has_one_within_the_spacing():
 
 
 @pytest.mark.parametrize(
-    "make", [lambda mesh: Ground.of(mesh, SurfaceResponse(), DOMAIN).clearance.parts, lambda mesh: _keys(mesh)]
+    "make", [lambda mesh: Ground.of(mesh, SurfaceResponse(), DOMAIN).cells.clearance.parts, lambda mesh: _keys(mesh)]
 )
 def test_maps_of_a_floor_do_not_depend_on_how_far_it_goes_and_neither_does_their_memory(make):
     """A floor of 400 km in points 6 cm apart would be 10^14 of them."""

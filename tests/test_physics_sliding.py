@@ -12,8 +12,14 @@ import torch
 from pgsd_nerfstudio.physics.bodies import GRAVITY, Bodies
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
 
 STEP = 0.04
+
+
+def cells(surface: SurfaceMesh) -> TriangleCells:
+    lower, upper = surface.bounds.numpy()
+    return TriangleCells.of(surface, lower - 1, upper + 1)
 
 
 def slope(degrees: float) -> SurfaceMesh:
@@ -36,7 +42,7 @@ def body(speed: float = 100.0, x: float = -1.0, degrees: float = 0.0, v: float =
 
 @pytest.mark.parametrize(("degrees", "friction"), [(30.0, 0.0), (30.0, 0.3), (50.0, 0.5), (80.0, 0.3)])
 def test_a_slider_accelerates_as_coulomb_says(degrees, friction):
-    bodies, surface, angle = body(degrees=degrees), slope(degrees), math.radians(degrees)
+    bodies, surface, angle = body(degrees=degrees), cells(slope(degrees)), math.radians(degrees)
     frames = 8
     for _ in range(frames):
         bodies = slide(bodies, surface, friction, STEP).bodies
@@ -49,7 +55,7 @@ def test_a_slider_accelerates_as_coulomb_says(degrees, friction):
 
 
 def test_friction_above_the_slope_stops_it_and_it_rests():
-    bodies, surface = body(degrees=20.0, v=1.0), slope(20.0)
+    bodies, surface = body(degrees=20.0, v=1.0), cells(slope(20.0))
     angle = math.radians(20)
     for _ in range(30):
         moved = slide(bodies, surface, 0.6, STEP)
@@ -62,7 +68,7 @@ def test_friction_above_the_slope_stops_it_and_it_rests():
 
 
 def test_it_is_never_faster_than_it_would_fall():
-    bodies, surface = body(speed=0.8, degrees=70.0, x=-1.8), slope(70.0)
+    bodies, surface = body(speed=0.8, degrees=70.0, x=-1.8), cells(slope(70.0))
     for _ in range(40):
         bodies = slide(bodies, surface, 0.1, STEP).bodies
         assert np.linalg.norm(bodies.velocities) <= 0.8 + 1e-6
@@ -70,7 +76,7 @@ def test_it_is_never_faster_than_it_would_fall():
 
 @pytest.mark.parametrize("speed", [0.3, 2.0])
 def test_beyond_an_edge_it_flies_with_its_velocity(speed):
-    bodies, surface = body(speed=speed, degrees=45.0, x=1.97, v=speed), slope(45.0)  # no faster than that
+    bodies, surface = body(speed=speed, degrees=45.0, x=1.97, v=speed), cells(slope(45.0))  # no faster than that
     for _ in range(10):
         moved = slide(bodies, surface, 0.0, STEP)
         bodies = moved.bodies
@@ -87,7 +93,7 @@ def test_along_a_wall_it_falls_freely_up_to_its_terminal_speed():
     wall = SurfaceMesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32))
     bodies = replace(body(), positions=np.array([[0.001, 0.0, 3.0]], np.float32))
     for _ in range(5):
-        bodies = slide(bodies, wall, 0.5, STEP).bodies
+        bodies = slide(bodies, cells(wall), 0.5, STEP).bodies
     assert bodies.velocities[0, 2] == pytest.approx(-GRAVITY * 5 * STEP, rel=1e-3)
 
 
@@ -102,6 +108,6 @@ def test_a_slider_stops_at_a_wall_and_is_never_inside_of_it(v):
     )
     bodies, farthest = body(degrees=45.0, x=0.45, v=v), 0.0
     for _ in range(20):
-        bodies = slide(bodies, house, 0.2, STEP).bodies
+        bodies = slide(bodies, cells(house), 0.2, STEP).bodies
         farthest = max(farthest, float(bodies.positions[0, 0]))
     assert 0.4 < farthest < 0.5

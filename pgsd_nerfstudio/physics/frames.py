@@ -142,9 +142,7 @@ class _Simulation:
     def _slide(self, frame: int) -> Bodies:
         """Move sliders and land the slow ones; returns the sliders that fly again."""
         air, log = self.air, self.log
-        # Rays and closest points of neighbours one after the other take half of the time.
-        order = along_curve(self.sliding.positions, np.asarray(air.domain.lower), np.asarray(air.domain.upper))
-        moved = slide(self.sliding.select(order), air.ground.surface, air.effect.surface.friction, air.step)
+        moved = slide(self.sliding, air.ground.cells, air.effect.surface.friction, air.step)
         log.see(moved.bodies, frame)
         rests = moved.rests
         self._land(moved.bodies.select(rests), frame)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 Profile = Literal["metric", "paper"]
-_REVISION = 8  # of the computation; a stored history of another revision is not used
+_REVISION = 9  # of the computation; a stored history of another revision is not used
 
 
 def motion_prior(

@@ -45,12 +45,19 @@ class Clearance(NamedTuple):
             upper: opposite corner of the box, m.
             cell: edge of a cell in metres; it grows where there would be more than MAX_CELLS.
         """
-        lower, size = np.asarray(lower, np.float64), np.asarray(upper, np.float64) - np.asarray(lower, np.float64)
-        while math.prod((size / cell + 2 * REACH + 1).tolist()) > MAX_CELLS:
-            cell *= 1.05
-        start = lower - REACH * cell
-        x, y, z = (np.ceil(size / cell).astype(int) + 2 * REACH).tolist()
-        return Clearance(start, float(cell), _parts(occupied_cells(surface, start, cell, (x, y, z))))
+        start, cell, shape = box_of_cells(lower, upper, cell)
+        return Clearance.around(occupied_cells(surface, start, cell, shape), start, cell)
+
+    @staticmethod
+    def around(occupied: Bool[ndarray, "x y z"], lower: Float[ndarray, "3"], cell: float) -> Clearance:
+        """The clearance of cells that are occupied.
+
+        Args:
+            occupied: cells of a box.
+            lower: corner of the first cell, m.
+            cell: edge of a cell, m.
+        """
+        return Clearance(lower, cell, _parts(occupied))
 
     def near(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], room: float = 0.0) -> Int[ndarray, " c"]:
         """Indices of the straight paths that may come within `room` of the surface, ascending; all others cannot.
@@ -65,6 +72,23 @@ class Clearance(NamedTuple):
         return _near(start, stop, room, self.lower, self.cell, self.parts)
 
 
+def box_of_cells(
+    lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], cell: float = CELL
+) -> tuple[Float[ndarray, "3"], float, tuple[int, int, int]]:
+    """Corner of the first cell in metres, edge of a cell, and numbers of cells that cover a box and REACH cells around it.
+
+    Args:
+        lower: corner of the box, m.
+        upper: opposite corner of the box, m.
+        cell: edge of a cell in metres; it grows where there would be more than MAX_CELLS.
+    """
+    lower, size = np.asarray(lower, np.float64), np.asarray(upper, np.float64) - np.asarray(lower, np.float64)
+    while math.prod((size / cell + 2 * REACH + 1).tolist()) > MAX_CELLS:
+        cell *= 1.05
+    x, y, z = (np.ceil(size / cell).astype(int) + 2 * REACH).tolist()
+    return lower - REACH * cell, float(cell), (x, y, z)
+
+
 def occupied_cells(
     surface: SurfaceMesh, lower: Float[ndarray, "3"], cell: float, shape: tuple[int, int, int]
 ) -> Bool[ndarray, "x y z"]:
@@ -76,22 +100,44 @@ def occupied_cells(
         cell: edge of a cell, m.
         shape: cells along each axis.
     """
-    occupied = np.zeros(shape, np.bool_)
+    occupied = np.zeros(math.prod(shape), np.bool_)
+    occupied[cells_of_triangles(surface, lower, cell, shape)[0]] = True
+    return occupied.reshape(shape)
+
+
+def cells_of_triangles(
+    surface: SurfaceMesh, lower: Float[ndarray, "3"], cell: float, shape: tuple[int, int, int]
+) -> tuple[Int[ndarray, " m"], Int[ndarray, " m"]]:
+    """Flat indices of the cells in which triangles lie, or nearly, and the triangle of each, in the order of the triangles.
+
+    Args:
+        surface: the mesh, in metres.
+        lower: corner of the first cell, m.
+        cell: edge of a cell, m.
+        shape: cells along each axis.
+    """
     vertices = (surface.vertices.numpy(force=True).astype(np.float64) - lower) / cell
-    _occupy(vertices, surface.triangles.numpy(force=True), occupied)
-    return occupied
+    return _cells_of(vertices, surface.triangles.numpy(force=True), shape)
 
 
 @numba.njit(cache=True, nogil=True)
-def _occupy(vertices, triangles, occupied):
-    """Mark the cells of all triangles; vertices in cells.
+def _longer(values, count):
+    grown = np.empty(2 * count + 1024, np.int32)
+    grown[: len(values)] = values
+    return grown
+
+
+@numba.njit(cache=True, nogil=True)
+def _cells_of(vertices, triangles, shape):
+    """Cells and owners, see `cells_of_triangles`; vertices in cells.
 
     In the plan across the axis of a triangle's largest normal component, squares are left out that an edge separates from it.
     Along that axis the plane of the triangle bounds the cells.
     """
-    shape = occupied.shape
+    cells, owners, count = np.empty(6 * len(triangles) + 1024, np.int32), np.empty(6 * len(triangles) + 1024, np.int32), 0
+    stride = (shape[1] * shape[2], shape[2], 1)
     at, low, high, normal = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    begin, end, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
     half = 0.5 + ROOM
     for f in range(len(triangles)):
         outside, several = False, 0
@@ -107,10 +153,14 @@ def _occupy(vertices, triangles, occupied):
         if outside:
             continue
         if several <= 1:  # a row of cells
+            number = (end[0] - begin[0]) + (end[1] - begin[1]) + (end[2] - begin[2]) + 1
+            if count + number > len(cells):
+                cells, owners = _longer(cells, count + number), _longer(owners, count + number)
             for i in range(begin[0], end[0] + 1):
                 for j in range(begin[1], end[1] + 1):
                     for k in range(begin[2], end[2] + 1):
-                        occupied[i, j, k] = True
+                        cells[count], owners[count] = i * stride[0] + j * stride[1] + k, f
+                        count += 1
             continue
         deep = 0
         for axis in range(3):
@@ -139,9 +189,13 @@ def _occupy(vertices, triangles, occupied):
                     middle = at[0, deep] + slope_u * (i + 0.5 - at[0, u]) + slope_v * (j + 0.5 - at[0, v])
                     lowest = max(lowest, math.floor(max(middle - thick, -1.0)))
                     highest = min(highest, math.floor(min(middle + thick, shape[deep] + 1.0)))
+                if count + highest + 1 - lowest > len(cells):
+                    cells = _longer(cells, count + highest + 1 - lowest)
+                    owners = _longer(owners, count + highest + 1 - lowest)
                 for k in range(lowest, highest + 1):
-                    place[u], place[v], place[deep] = i, j, k
-                    occupied[place[0], place[1], place[2]] = True
+                    cells[count], owners[count] = i * stride[u] + j * stride[v] + k * stride[deep], f
+                    count += 1
+    return cells[:count], owners[:count]
 
 
 @numba.njit(cache=True, nogil=True)

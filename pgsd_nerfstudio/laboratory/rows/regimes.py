@@ -20,6 +20,7 @@ from pgsd_nerfstudio.physics.ground.cover import Cover, CoverConfig
 from pgsd_nerfstudio.physics.ground.sliding import LIFT, slide
 from pgsd_nerfstudio.physics.record.codec import encode
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
+from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
 
 DOMAIN = Domain((-3.0, -3.0, -0.2), (3.0, 3.0, 4.0))
 STILL = Wind(speed=0.0, turbulence=0.0, flutter=0.0)
@@ -111,8 +112,9 @@ def _slider_error() -> float:
     one["speeds"][:] = 100.0
     one["positions"][:] = [-1 + LIFT * math.sin(angle), 0, math.tan(angle) + LIFT * math.cos(angle)]
     bodies = Bodies(**one)
+    cells = TriangleCells.of(SurfaceMesh(corners, FACES), np.full(3, -3.0), np.full(3, 3.0))
     for _ in range(10):
-        bodies = slide(bodies, SurfaceMesh(corners, FACES), 0.3, 0.04).bodies
+        bodies = slide(bodies, cells, 0.3, 0.04).bodies
     known = (math.sin(angle) - 0.3 * math.cos(angle)) * GRAVITY * 0.4
     return 100 * abs(float(np.linalg.norm(bodies.velocities)) / known - 1)
 

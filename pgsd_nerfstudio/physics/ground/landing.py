@@ -8,11 +8,9 @@ and with a linearly falling chance in between. A particle that does not stay sli
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -21,15 +19,12 @@ from numpy import ndarray
 from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.curve import along_curve
-from pgsd_nerfstudio.surface.clearance import Clearance
+from pgsd_nerfstudio.physics.ground.probing import SMALLEST, probed
+from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
-PROBE_RINGS = (0.25, 0.5, 1.0)  # radii of the rings, relative to SurfaceResponse.probe
-PROBES = 8  # rays per ring
-SMALLEST = 0.15  # relative to SurfaceResponse.probe; extent where the first ring finds no surface, as on a blade of grass
-ROUGH = 0.35  # rise per run up to which the neighbourhood counts as the same surface
 GRAZING = 0.2  # smallest sine of the angle between path and surface with which a path is shortened by the cover
 
 
@@ -83,11 +78,11 @@ class RestPose(NamedTuple):
 
 @dataclass(frozen=True)
 class Ground:
-    """A surface prepared for contacts, with a map of the clearance around it."""
+    """A surface prepared for contacts, with its triangles by small cells."""
 
     surface: SurfaceMesh
     response: SurfaceResponse
-    clearance: Clearance
+    cells: TriangleCells
 
     @staticmethod
     def of(surface: SurfaceMesh, response: SurfaceResponse, domain: Domain) -> Ground:
@@ -98,7 +93,7 @@ class Ground:
             response: how particles land on it.
             domain: the simulated air.
         """
-        return Ground(surface, response, Clearance.of(surface, np.asarray(domain.lower), np.asarray(domain.upper)))
+        return Ground(surface, response, TriangleCells.of(surface, np.asarray(domain.lower), np.asarray(domain.upper)))
 
     def meet(self, start: Float[ndarray, "n 3"], stop: Float[ndarray, "n 3"], cover: Raised | None = None) -> Meeting:
         """First contacts of straight paths with the surface or the cover on it.
@@ -109,7 +104,7 @@ class Ground:
             cover: None where the surface is bare.
         """
         thickest = cover.thickest if cover is not None else 0.0
-        tried = self.clearance.near(start, stop, thickest)
+        tried = self.cells.clearance.near(start, stop, thickest)
         if len(tried) == 0 or len(self.surface.triangles) == 0:
             return Meeting(tried[:0], start[:0], start[:0])
         # Rays of neighbours one after the other take a third of the time.
@@ -132,7 +127,8 @@ class Ground:
     @property
     def _box(self) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
         """Corners of the map, m."""
-        return self.clearance.lower, self.clearance.lower + self.clearance.cell * np.array(self.clearance.parts.shape)
+        where = self.cells.clearance
+        return where.lower, where.lower + where.cell * np.array(where.parts.shape)
 
     def open_above(self, points: Float[ndarray, "n 3"], toward: Float[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
         """Whether the surface does not hide each point from the sky.
@@ -176,56 +172,14 @@ class Ground:
         if len(points) == 0 or len(self.surface.triangles) == 0:
             return RestPose(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
         points = points - raised
-        closest = self.surface.closest(torch.from_numpy(points.astype(np.float32)))
-        at, normal = closest.points.numpy(), _upward(closest.normals.numpy())
-        normal, extent = self._probe(at, normal)
+        at, normal, extent, found = probed(self.cells, points, self.response.probe)
+        lost = (found < 0).nonzero()[0]
+        if len(lost):  # on the highest heaps of dense matter, and outside of the domain
+            closest = self.surface.closest(torch.from_numpy(points[lost].astype(np.float32)))
+            at[lost], normal[lost] = closest.points.numpy(), _upward(closest.normals.numpy())
+            extent[lost] = SMALLEST * self.response.probe
         quats = _rotations(normal, spin)
         return RestPose((at + self.response.settle * normal + raised).astype(np.float32), quats, extent)
-
-    def _probe(
-        self, at: Float[ndarray, "h 3"], normal: Float[ndarray, "h 3"]
-    ) -> tuple[Float[ndarray, "h 3"], Float[ndarray, " h"]]:
-        """Normals averaged over the neighbourhood of each point, and the radius to which the surface is unbroken around it.
-
-        Rays are cast along the normal onto rings around the point. The surface is unbroken where they hit it within ROUGH of
-        the plane.
-        """
-        axes = np.stack([normal, *_tangents(normal)], 1)
-        extent = np.full(len(at), SMALLEST * self.response.probe, np.float32)
-        unbroken, total = np.arange(len(at)), 2.0 * normal
-        for share in PROBE_RINGS:
-            if len(unbroken) == 0:
-                break
-            radius = share * self.response.probe
-            tolerance = ROUGH * radius + 0.01
-            found = self.surface.first_hits(*_ring(at, axes, unbroken, radius, 2 * tolerance))
-            same = (np.abs(found.distance - 2 * tolerance) <= tolerance).reshape(-1, PROBES)
-            normals = np.zeros((same.size, 3), np.float32)
-            hit = same.ravel().nonzero()[0]
-            normals[hit] = self.surface.normals_of(found, hit)
-            total[unbroken] += normals.reshape(-1, PROBES, 3).sum(1)
-            unbroken = unbroken[same.sum(1) >= PROBES - 1]  # a single miss is a hole in a scanned mesh rather than an edge
-            extent[unbroken] = radius
-        smooth = _upward(total / np.linalg.norm(total, axis=1, keepdims=True).clip(1e-6))
-        return smooth, extent
-
-
-@numba.njit(cache=True, nogil=True)
-def _ring(at, axes, which, radius, height):
-    """Origins and directions of PROBES rays around some of the points, from `height` above their planes down onto a ring.
-
-    `axes` [h, 3, 3] has the normal of each plane and two tangents.
-    """
-    origins, directions = np.empty((PROBES * len(which), 3), np.float32), np.empty((PROBES * len(which), 3), np.float32)
-    for n in range(len(which)):
-        for probe in range(PROBES):
-            turn = 2 * np.pi * probe / PROBES
-            along, across = radius * math.cos(turn), radius * math.sin(turn)
-            for axis in range(3):
-                normal, first, second = axes[which[n], 0, axis], axes[which[n], 1, axis], axes[which[n], 2, axis]
-                origins[PROBES * n + probe, axis] = at[which[n], axis] + height * normal + along * first + across * second
-                directions[PROBES * n + probe, axis] = -normal
-    return origins, directions
 
 
 def _raised(
@@ -256,13 +210,6 @@ def _raised(
 
 def _upward(normal: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
     return np.where(normal[:, 2:] < 0, -normal, normal)
-
-
-def _tangents(normal: Float[ndarray, "n 3"]) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"]]:
-    """Two unit vectors square to upward normals (Duff et al., "Building an orthonormal basis, revisited", 2017)."""
-    x, y, z = normal.T
-    b = -x * y / (1 + z)
-    return np.stack([1 - x * x / (1 + z), b, -x], 1), np.stack([b, 1 - y * y / (1 + z), -y], 1)
 
 
 def _rotations(normal: Float[ndarray, "n 3"], spin: Float[ndarray, " n"]) -> Float[ndarray, "n 4"]:
