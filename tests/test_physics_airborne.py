@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.effects.effect import Wind
-from pgsd_nerfstudio.physics.air.airborne import _SINE, Flutter, advance, air_velocity
+from pgsd_nerfstudio.physics.air.airborne import _COSINE, _SINE, Flutter, advance, air_velocity
 from pgsd_nerfstudio.physics.air.deflection import Deflection
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import GRAVITY
@@ -135,7 +135,7 @@ def test_the_step_is_second_order_in_changing_wind():
     assert errors[1] / errors[2] > 3.2
 
 
-def test_the_polynomial_is_the_sine():
-    r = np.linspace(-0.25, 0.25, 10_001)
-    poly = r * np.polyval(_SINE[::-1], r * r)
-    assert np.abs(poly - np.sin(2 * math.pi * r)).max() < 4e-9
+def test_the_polynomials_are_sine_and_cosine():
+    r = np.linspace(-0.5, 0.5, 10_001)
+    assert np.abs(r * np.polyval(_SINE[::-1], r * r) - np.sin(math.pi * r)).max() < 4e-9
+    assert np.abs(np.polyval(_COSINE[::-1], r * r) - np.cos(math.pi * r)).max() < 3e-10

@@ -69,12 +69,13 @@ class Bodies:
         which = np.asarray(which)
         if which.dtype == np.bool_:
             which = which.nonzero()[0]  # found once for all arrays
-        return Bodies(*(getattr(self, f.name).take(which, 0) for f in fields(self)))
+        return Bodies(*[values.take(which, 0) for values in vars(self).values()])
 
     @staticmethod
     def join(parts: Sequence[Bodies]) -> Bodies:
         """All particles of the parts, in their order, as new arrays."""
-        return Bodies(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Bodies)))
+        some = [vars(part) for part in parts if len(part)] or [vars(parts[0])]
+        return Bodies(*[np.concatenate([part[name] for part in some]) for name in some[0]])
 
     def marked(self, kind: int) -> Bodies:
         """The same particles with a bit of their kinds set.

@@ -23,7 +23,7 @@ from pgsd_nerfstudio.scene.scene import Scene
 from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_tensors
 from pgsd_nerfstudio.surface.depth import SETTINGS, chosen_views, render_depths, without_sky
 from pgsd_nerfstudio.surface.fusion import Fusion, Region, fuse, open3d, without_silhouettes
-from pgsd_nerfstudio.surface.smooth_normals import smooth_normals
+from pgsd_nerfstudio.surface.smooth_normals import smooth_normals, vertex_normals
 
 VERSION = 2  # of the fusion; cached meshes of another version are not read
 NEAR_VOXEL, FAR_VOXEL, REACH = 1 / 80, 1 / 16, 4.0  # in radii: median distance from the cameras to what they look at
@@ -109,7 +109,11 @@ class SurfaceMesh:
             origins: where the rays start, in metres.
             directions: of any length; distances count in this length.
         """
-        found = self.raycasting.cast_rays(queries(origins, directions), _threads(len(origins)))
+        return self.hits_of(queries(origins, directions))
+
+    def hits_of(self, rays: Any) -> RayHits:
+        """First hits of rays, given as Open3D's tensor of origins and directions side by side; see `first_hits`."""
+        found = self.raycasting.cast_rays(rays, _threads(len(rays)))
         return RayHits(*(found[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")))
 
     def normals_of(self, found: RayHits, which: Int[np.ndarray, " h"]) -> Float[np.ndarray, "h 3"]:
@@ -119,7 +123,8 @@ class SurfaceMesh:
             found: hits of rays.
             which: indices of rays that have a hit.
         """
-        return smooth_normals(self.corner_normals, found.triangles, found.weights, found.own_normals, which)
+        mesh = self.vertex_normals.numpy(), self.triangles.numpy(force=True)
+        return smooth_normals(*mesh, found.triangles, found.weights, found.own_normals, which)
 
     def closest(self, points: Points) -> Closest:
         """Nearest points of the surface, however far away.
@@ -143,15 +148,7 @@ class SurfaceMesh:
     @cached_property
     def vertex_normals(self) -> Float[Tensor, "v 3"]:
         """Unit normals of the vertices: the mean of the adjoining triangles' normals, weighted by area."""
-        corners = self.vertices[self.triangles.long()]
-        area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        total = torch.zeros_like(self.vertices).index_add_(0, self.triangles.long().flatten(), area.repeat_interleave(3, 0))
-        return torch.nn.functional.normalize(total, dim=1)
-
-    @cached_property
-    def corner_normals(self) -> Float[np.ndarray, "f 3 3"]:
-        """Unit normals at the corners of every triangle."""
-        return self.vertex_normals.numpy()[self.triangles.numpy()]
+        return torch.from_numpy(vertex_normals(self.vertices.float().numpy(force=True), self.triangles.numpy(force=True)))
 
     @cached_property
     def raycasting(self) -> Any:

@@ -19,7 +19,9 @@ from numpy import ndarray
 from pgsd_nerfstudio.effects.effect import SurfaceResponse
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.curve import along_curve
+from pgsd_nerfstudio.physics.ground.paths import rays_along, within_reach
 from pgsd_nerfstudio.physics.ground.probing import SMALLEST, probed
+from pgsd_nerfstudio.surface.fusion import open3d
 from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
 
 if TYPE_CHECKING:
@@ -109,20 +111,18 @@ class Ground:
             return Meeting(tried[:0], start[:0], start[:0])
         # Rays of neighbours one after the other take a third of the time.
         tried = tried[along_curve(start[tried], *self._box)]
-        start = start[tried]
-        path = stop[tried] - start
-        length = np.sqrt((path * path).sum(1))
-        direction = path / length[:, None]
-        found = self.surface.first_hits(start, direction)
-        hit = (found.distance <= length + thickest / GRAZING).nonzero()[0]
-        start, direction, length, distance = start[hit], direction[hit], length[hit], found.distance[hit]
-        normal = self.surface.normals_of(found, hit)
-        normal = np.where((normal * direction).sum(1, keepdims=True) > 0, -normal, normal)
+        rays, lengths = rays_along(start, stop, tried)
+        found = self.surface.hits_of(open3d().core.Tensor(rays))
+        mesh = self.surface.vertex_normals.numpy(), self.surface.triangles.numpy(force=True)
+        hit, normal = within_reach(*found, rays, lengths, thickest, GRAZING, *mesh)
+        ray, distance = rays[hit], found.distance[hit]
         if cover is not None and thickest > 0:
-            distance, normal = _raised(cover, start, direction, distance, normal)
-        met = (distance <= length).nonzero()[0]
-        met = met[np.argsort(tried[hit[met]])]
-        return Meeting(tried[hit[met]], start[met] + direction[met] * distance[met, None], normal[met])
+            distance, normal = _raised(cover, ray[:, :3], ray[:, 3:], distance, normal)
+            met = (distance <= lengths[hit]).nonzero()[0]
+            hit, ray, distance, normal = hit[met], ray[met], distance[met], normal[met]
+        order = np.argsort(tried[hit])
+        points = ray[order, :3] + ray[order, 3:] * distance[order, None]
+        return Meeting(tried[hit[order]], points, normal[order])
 
     @property
     def _box(self) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
