@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pgsd_nerfstudio.laboratory.records import Record
+from pgsd_nerfstudio.laboratory.rows.coverage import by_distance
 from pgsd_nerfstudio.laboratory.rows.rasterizer import bench, leaves, psnr
 from pgsd_nerfstudio.laboratory.yard import view_into_yard, yard_flakes
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
@@ -35,6 +36,7 @@ def verify(quick: bool) -> list[Record]:
         *_against_the_reference(seeds),
         _merged_exactly(seeds),
         *_coverage(quick),
+        *by_distance(quick),
         *_against_gsplat_formulas(),
         _against_gsplat_on_cuda(),
         _names_what_is_not_finite(),
