@@ -101,3 +101,23 @@ def test_gradients_of_what_moves_pass_through_the_air():
 def test_a_wrong_number_of_moments_is_refused():
     with pytest.raises(ValueError, match="one moment for each of the 2 cameras, found 3"):
         CpuRasterizer(random_gaussians(5, 8)).render(random_cameras(2, 16, 16), None, None, [None] * 3)
+
+
+class Watching(Dusk):
+    """A moment that remembers the gaps it was shown."""
+
+    def background(self, own, view: Viewpoint, gaps):
+        self.light = gaps.light.clone()
+        return super().background(own, view, gaps)
+
+
+@pytest.mark.parametrize("moving_opacity", [0.3, 1.0])
+def test_the_gaps_of_a_picture_made_in_one_walk_are_those_of_the_frozen_scene(moving_opacity: float):
+    frozen, moving, cameras = random_gaussians(80, 9), random_gaussians(60, 10), random_cameras(1, 53, 37)
+    moving = replace(moving, opacities=torch.full_like(moving.opacities, moving_opacity))
+    once, alone = Watching(0.0), Watching(0.0)
+    picture = CpuRasterizer(frozen).render(cameras, moving, None, once)
+    CpuRasterizer(frozen).render(cameras, None, None, alone)
+    lit = picture.accumulation[0] < 0.9  # a pixel with more may have been finished by what moves before all that is frozen
+    assert float((alone.light[lit] < 0.9).float().mean()) > 0.1
+    assert (once.light - alone.light)[lit].abs().max() < 1e-6

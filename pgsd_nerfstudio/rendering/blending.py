@@ -29,37 +29,52 @@ from pgsd_nerfstudio.rendering.tile import (
     tiles_of,
 )
 
-# Places in the rows of a tile while it is blended: light, colours, weighted depth.
+# Places in the rows of a tile while it is blended: light, colours, weighted depth; what chosen splats let through.
 R, G, B, Z = 16, 32, 48, 64
 ROW = 80
+THROUGH, WITH_THROUGH = 80, 96
 
 
-@kernel()
-def blend_splat(splats, i, tile, left, top, max_alpha, min_transmittance):
-    """Add one splat to a tile [16, 80] whose first pixel is (left, top)."""
-    half_precision, shear, half_drop = ellipse(splats, i)
-    opacity, cutoff = splats[i, OPACITY], splats[i, CUTOFF]
-    red, green, blue, depth = splats[i, RED], splats[i, GREEN], splats[i, BLUE], splats[i, DEPTH]
-    first, last = rows_of(splats, i, top)
-    for y in range(first, last):
-        _, base, offset = row_of(splats, i, shear, half_drop, left, top + y)
-        if row_misses(offset, half_precision, base, cutoff):
-            continue
-        row = tile[y]
-        for x in range(16):
-            across = F(np.int32(x)) + offset
-            sigma = half_precision * across * across + base
-            alpha = min(opacity * falloff(sigma), max_alpha)
-            before = row[LIGHT + x]
-            after = before * (F(1) - alpha)
-            touched = (sigma <= cutoff) & (before > F(0))
-            finished = after <= min_transmittance
-            weight = alpha * before if touched & (not finished) else F(0)
-            row[R + x] += weight * red
-            row[G + x] += weight * green
-            row[B + x] += weight * blue
-            row[Z + x] += weight * depth
-            row[LIGHT + x] = light_left(before, after, touched, finished)
+def _blender(through):
+    """A kernel that blends one splat; with `through`, a constant to the compiler, it counts what such splats let through."""
+
+    @kernel()
+    def blend(splats, i, tile, left, top, max_alpha, min_transmittance):
+        """Add one splat to a tile whose first pixel is (left, top)."""
+        half_precision, shear, half_drop = ellipse(splats, i)
+        opacity, cutoff = splats[i, OPACITY], splats[i, CUTOFF]
+        red, green, blue, depth = splats[i, RED], splats[i, GREEN], splats[i, BLUE], splats[i, DEPTH]
+        first, last = rows_of(splats, i, top)
+        for y in range(first, last):
+            _, base, offset = row_of(splats, i, shear, half_drop, left, top + y)
+            if row_misses(offset, half_precision, base, cutoff):
+                continue
+            row = tile[y]
+            for x in range(16):
+                across = F(np.int32(x)) + offset
+                sigma = half_precision * across * across + base
+                alpha = min(opacity * falloff(sigma), max_alpha)
+                before = row[LIGHT + x]
+                after = before * (F(1) - alpha)
+                touched = (sigma <= cutoff) & (before > F(0))
+                finished = after <= min_transmittance
+                weight = alpha * before if touched & (not finished) else F(0)
+                row[R + x] += weight * red
+                row[G + x] += weight * green
+                row[B + x] += weight * blue
+                row[Z + x] += weight * depth
+                if through:
+                    passed = row[THROUGH + x] * (F(1) - alpha)
+                    row[THROUGH + x] = passed if touched & (passed > min_transmittance) else row[THROUGH + x]
+                row[LIGHT + x] = light_left(before, after, touched, finished)
+
+    return blend
+
+
+blend_splat = _blender(False)
+"""Add splat i to a tile [16, 80 or 96] whose first pixel is (left, top)."""
+blend_counted_splat = _blender(True)
+"""As `blend_splat`, of a tile [16, 96], whose last plane keeps the light that the splats added in this way let through."""
 
 
 @kernel()

@@ -10,20 +10,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pgsd_nerfstudio.rendering.binning import Binned, keep_entries
-from pgsd_nerfstudio.rendering.blending import blend_frozen
+from pgsd_nerfstudio.rendering.binning import Binned
 from pgsd_nerfstudio.rendering.compilation import workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
 from pgsd_nerfstudio.rendering.moment import Gaps, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
-from pgsd_nerfstudio.rendering.rasterizer import TILE, Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
+from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.walk import blend_at_once, blend_backward, blend_merged
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.scene.spherical_harmonics import view_colors
-
-LEAST_LIGHT = np.float32(0.02)  # share of the light in a pixel below which what is behind the scene does not matter
 
 
 class CpuRasterizer:
@@ -142,8 +139,9 @@ class _RenderMerged(torch.autograd.Function):
         if frozen.image is None:
             assert isinstance(frozen.part, Binned)
             image = np.empty((5, height, width), np.float32)
-            blend_at_once(frozen.part, dynamic, width, height, *limits, image)
-            light = _light_of_frozen(image, dynamic, limits) if asked else image[0]
+            light = np.empty((height, width) if asked else (0, 0), np.float32)
+            blend_at_once(frozen.part, dynamic, width, height, *limits, image, light)
+            light = light if asked else image[0]
         else:
             image = frozen.image.copy()
             blend_merged(frozen.part, dynamic, width, height, *limits, image)
@@ -160,23 +158,6 @@ class _RenderMerged(torch.autograd.Function):
         gradients = _gradients(ctx.walk, Gaussians(*ctx.saved_tensors), to_image)
         typed = (gradient.to(tensor.dtype) for gradient, tensor in zip(gradients, ctx.saved_tensors, strict=True))
         return None, None, None, None, None, *typed
-
-
-def _light_of_frozen(image: np.ndarray, dynamic: Binned, limits: tuple[np.float32, np.float32]) -> np.ndarray:
-    """Share of light [h, w] that the frozen splats of a merged image let through.
-
-    It is the light of the image over that which the dynamic splats alone let through. These are blended once more only in tiles
-    where some light is left.
-    """
-    height, width = image.shape[1:]
-    down, across = -(-height // TILE), -(-width // TILE)
-    padded = np.zeros((down * TILE, across * TILE), np.float32)
-    padded[:height, :width] = image[0]
-    open_tiles = (padded.reshape(down, TILE, across, TILE) > LEAST_LIGHT).any((1, 3)).ravel()
-    some = keep_entries(dynamic, np.repeat(open_tiles, np.diff(dynamic.offsets)))
-    alone = np.empty_like(image)
-    blend_frozen(some, width, height, *limits, alone, np.zeros(len(some.entries), bool))
-    return np.minimum(image[0] / np.maximum(alone[0], np.float32(1e-4)), np.float32(1))
 
 
 def _gradients(walk: _Walk, gaussians: Gaussians, to_image: Tensor) -> list[Tensor]:

@@ -16,24 +16,30 @@ import numpy as np
 from numba.extending import overload
 
 from pgsd_nerfstudio.rendering.binning import Binned
-from pgsd_nerfstudio.rendering.blending import ROW, blend_splat, store_tile
+from pgsd_nerfstudio.rendering.blending import ROW, THROUGH, WITH_THROUGH, blend_counted_splat, blend_splat, store_tile
 from pgsd_nerfstudio.rendering.blending_gradient import GRADIENT_ROW, SUMS, pass_dynamic, pass_frozen, start_tile
 from pgsd_nerfstudio.rendering.compilation import aligned, kernel, share_out, workers
 from pgsd_nerfstudio.rendering.layers import Layers, blend_layer, pass_layer
 from pgsd_nerfstudio.rendering.projection import DEPTH
 from pgsd_nerfstudio.rendering.rasterizer import TILE
-from pgsd_nerfstudio.rendering.tile import CHECK_EVERY, any_light, clear, pixels_of, tiles_of
+from pgsd_nerfstudio.rendering.tile import CHECK_EVERY, F, any_light, clear, pixels_of, tiles_of
 
 
 @kernel()
-def _walk_splats(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance):
-    """Blend both lists of splats of tile t by depth; at equal depth the frozen splat comes first."""
+def _walk_splats(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through):
+    """Blend both lists of splats of tile t by depth; at equal depth the frozen splat comes first.
+
+    With `through`, the tile also keeps the light that the frozen splats alone let through.
+    """
     frozen_splats, frozen_entries, i, i_end = frozen.splats, frozen.entries, frozen.offsets[t], frozen.offsets[t + 1]
     splats, entries, j, j_end = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
     seen = 0
     while i < i_end or j < j_end:
         if j == j_end or (i < i_end and frozen_splats[frozen_entries[i], DEPTH] <= splats[entries[j], DEPTH]):
-            blend_splat(frozen_splats, frozen_entries[i], tile, left, top, max_alpha, min_transmittance)
+            if through:
+                blend_counted_splat(frozen_splats, frozen_entries[i], tile, left, top, max_alpha, min_transmittance)
+            else:
+                blend_splat(frozen_splats, frozen_entries[i], tile, left, top, max_alpha, min_transmittance)
             i += 1
         else:
             blend_splat(splats, entries[j], tile, left, top, max_alpha, min_transmittance)
@@ -44,8 +50,11 @@ def _walk_splats(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittan
 
 
 @kernel()
-def _walk_layers(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance):
-    """Blend the layers and the dynamic splats of tile t by depth; at equal depth the layer comes first."""
+def _walk_layers(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through):
+    """Blend the layers and the dynamic splats of tile t by depth; at equal depth the layer comes first.
+
+    Layers are pressed from a scene that was blended alone, so `through` is never asked of them.
+    """
     depths, planes, steps = frozen.depths, frozen.planes, frozen.steps
     k, k_end = frozen.offsets[t], frozen.offsets[t + 1]
     splats, entries, first, last = dynamic.splats, dynamic.entries, dynamic.offsets[t], dynamic.offsets[t + 1]
@@ -96,7 +105,7 @@ def _walk_layers_backward(frozen, dynamic, t, tile, left, top, max_alpha, min_tr
             return
 
 
-def _walk(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance):
+def _walk(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through):
     """The walk over tile t for the type of `frozen`, in kernels."""
 
 
@@ -105,10 +114,10 @@ def _walk_backward(frozen, dynamic, t, tile, left, top, max_alpha, min_transmitt
 
 
 @overload(_walk, inline="always")
-def _walk_of(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance):
+def _walk_of(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through):
     walk = _walk_layers if frozen.instance_class is Layers else _walk_splats
-    return lambda frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance: walk(
-        frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance
+    return lambda frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through: walk(
+        frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through
     )
 
 
@@ -131,7 +140,8 @@ def blend_merged(
 ) -> None:
     """Blend the tiles that have dynamic splats again, in an image as `blend_frozen` left it."""
     limits = width, height, max_alpha, min_transmittance
-    share_out(_blend_merged, workers(), aligned(workers(), TILE, ROW), frozen, dynamic, False, *limits, image)
+    none = np.empty((0, 0), np.float32)
+    share_out(_blend_merged, workers(), aligned(workers(), TILE, ROW), frozen, dynamic, False, *limits, image, none)
 
 
 def blend_at_once(
@@ -142,22 +152,33 @@ def blend_at_once(
     max_alpha: np.float32,
     min_transmittance: np.float32,
     image: np.ndarray,  # [5, h, w] float32, written
+    light: np.ndarray,  # [h, w] float32, written, or [0, 0]
 ) -> None:
-    """Blend all tiles: the image of `blend_frozen` and `blend_merged`, to the bit, in one walk that prepares nothing."""
+    """Blend all tiles: the image of `blend_frozen` and `blend_merged`, to the bit, in one walk that prepares nothing.
+
+    `light` is what the frozen splats alone let through; in pixels that are finished, those up to there.
+    """
     limits = width, height, max_alpha, min_transmittance
-    share_out(_blend_merged, workers(), aligned(workers(), TILE, ROW), frozen, dynamic, True, *limits, image)
+    tiles = aligned(workers(), TILE, WITH_THROUGH if light.size else ROW)
+    share_out(_blend_merged, workers(), tiles, frozen, dynamic, True, *limits, image, light)
 
 
 @kernel()
-def _blend_merged(worker, workers, tiles, frozen, dynamic, everywhere, width, height, max_alpha, min_transmittance, image):
-    tile = tiles[worker]
+def _blend_merged(
+    worker, workers, tiles, frozen, dynamic, everywhere, width, height, max_alpha, min_transmittance, image, light
+):
+    tile, through = tiles[worker], light.size > 0
     for t in range(worker, tiles_of(width, height), workers):
         if not everywhere and dynamic.offsets[t] == dynamic.offsets[t + 1]:
             continue
         left, top, columns, rows = pixels_of(t, width, height)
         clear(tile, ROW, columns, rows)
-        _walk(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance)
+        if through:
+            tile[:, THROUGH:] = F(1)
+        _walk(frozen, dynamic, t, tile, left, top, max_alpha, min_transmittance, through)
         store_tile(tile, columns, rows, left, top, image)
+        if through:
+            light[top : top + rows, left : left + columns] = tile[:rows, THROUGH : THROUGH + columns]
 
 
 def blend_backward(
