@@ -64,8 +64,8 @@ def _by_distance(prepared: PreparedScene, name: str, intensity: float, times: in
             f"{name}, {intensity:g} mm/h: coverage {where} of the camera",
             apart, "times off", f"<= {FACTOR:g}", error=100 * error / max(solid, 1e-12), error_unit="% standard error",
             source=f"{100 * drawn:.4f} % drawn at {SIZE[0]}x{SIZE[1]}, {100 * solid:.4f} % by {samples} rays a pixel through "
-            f"ellipsoids of the particles' diameters that take what the Gaussians' peaks take (mean {float(peaks[there].mean()):.2f}"
-            f"); {len(there):,} particles",
+            "ellipsoids of the particles' diameters that take what the Gaussians' peaks take; "
+            f"{len(there):,} particles of a mean peak of {float(peaks[there].mean()):.2f}",
         )  # fmt: skip
 
 
