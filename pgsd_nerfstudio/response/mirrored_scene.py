@@ -36,7 +36,7 @@ AGAIN = 0.25  # m behind a hit from where a ray goes on that has met the rough g
 
 @dataclass(frozen=True, eq=False)
 class MirroredScene:
-    """The surroundings of mirrors, as linear light without weather."""
+    """The surroundings of mirrors, as linear light without weather but for clouds that take the sun."""
 
     surface: SurfaceMesh
     """In metres."""
@@ -52,7 +52,7 @@ class MirroredScene:
         """The surroundings that a scene's mirrors show.
 
         Args:
-            metric: the frozen Gaussians in metres, with plain RGB.
+            metric: the frozen Gaussians in metres, with plain RGB, as clouds light them.
             surface: mesh of the scene, in metres.
             middle: place in the open from which what is far is seen, m.
             sky: share of each Gaussian that is sky, 0..1.

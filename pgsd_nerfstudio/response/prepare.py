@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import domain_of
-from pgsd_nerfstudio.rendering.display import linear
+from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.answer import Answer
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
@@ -35,7 +35,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 MOST_SOFTENING = 8.0  # greatest factor and, inverse, least; shadows hold noise, which would be too bright with more
-_REVISION = 8  # of the computation; stored answers of another revision are not used
+_REVISION = 9  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -66,7 +66,9 @@ def answer_of(
         sky = sky_of(scene, metric)
         softening = softening_of(metric, exposure, surface, effect, sky)
         layer = layer_of(scene, metric, surface, effect, seed=seed)
-        water = water_of(scene, metric, surface, effect, sky, seed=seed)
+        # Mirrors show the surroundings without the shadows that the clouds take.
+        clouded = metric if softening is None else replace(metric, colors=encoded(linear(metric.colors) * softening))
+        water = water_of(scene, clouded, surface, effect, sky, seed=seed)
         answer = composed(scene, effect, exposure, softening, seconds=seconds, seed=seed, layer=layer, water=water)
         save_answer(path, answer)
     return replace(answer, edits=edits)

@@ -25,7 +25,7 @@ def water_of(
 
     Args:
         scene: the frozen scene.
-        metric: its Gaussians in metres, with plain RGB.
+        metric: its Gaussians in metres, with plain RGB, as the clouds of the full weather light them.
         surface: its mesh in metres.
         effect: the weather.
         sky: share of each Gaussian that is sky, 0..1.
