@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -86,6 +87,7 @@ class Bodies:
         return replace(self, kinds=self.kinds | np.uint8(kind))
 
     @staticmethod
+    @cache
     def none() -> Bodies:
         """No particles."""
         widths = {"positions": (0, 3), "velocities": (0, 3)}

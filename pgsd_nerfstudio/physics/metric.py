@@ -119,22 +119,22 @@ def simulate_metric(
             chunks.append(chunk)
             state = chunk.state
             bar.update(task, completed=start + frames)
-    deposits.restore(state.deposits)  # the last chunk may have come from the disk
-    about = {
-        "profile": "metric",
-        "effect": effect.name,
-        "seed": seed,
-        "intensity": effect.emission.intensity,
-        "unit": effect.emission.unit,
-        "domain": [*domain.lower, *domain.upper],
-        "air_simulated": air.sight.share,
-        "real_in_air": air.sizes.real_in_air,
-        "sharpness": air.sizes.sharpness,
-        **deposits.summary(),
-        "seconds": time.perf_counter() - began,
-    }
-    history = assemble(chunks, clock, about)
-    history.check_finite()
+        deposits.restore(state.deposits)  # the last chunk may have come from the disk
+        about = {
+            "profile": "metric",
+            "effect": effect.name,
+            "seed": seed,
+            "intensity": effect.emission.intensity,
+            "unit": effect.emission.unit,
+            "domain": [*domain.lower, *domain.upper],
+            "air_simulated": air.sight.share,
+            "real_in_air": air.sizes.real_in_air,
+            "sharpness": air.sizes.sharpness,
+            **deposits.summary(),
+            "seconds": time.perf_counter() - began,
+        }
+        history = assemble(chunks, clock, about)
+        history.check_finite()
     return history
 
 
