@@ -94,9 +94,9 @@ def test_without_clouds_or_sun_nothing_softens(scene, floor, monkeypatch):
 def test_mirrors_show_the_scene_without_the_shadows_that_clouds_take(scene, floor, monkeypatch):
     monkeypatch.setattr(prepare, "find_sunlight", lambda *_: Sunlight((0.0, 0.6, 0.8), 4.0, 0.2, 0.1, 9.0))
     darker = torch.tensor([0.25, 0.5, 1.0])
-    monkeypatch.setattr(prepare, "softening_of", lambda metric, *_: darker.expand(len(metric), 3))
+    monkeypatch.setattr(prepare, "softening_of", lambda metric, *_, **__: darker.expand(len(metric), 3))
     taken = answer_of(scene, floor, effect("rainfall"), seconds=5.0, seed=7).puddles
-    monkeypatch.setattr(prepare, "softening_of", lambda *_: None)
+    monkeypatch.setattr(prepare, "softening_of", lambda *_, **__: None)
     left = answer_of(scene, floor, effect("rainfall"), seconds=5.0, seed=8).puddles
     assert taken is not None and left is not None
     assert torch.allclose(taken.scene.light, darker * left.scene.light, atol=1e-5)

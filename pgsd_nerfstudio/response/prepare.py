@@ -13,6 +13,7 @@ from pgsd_nerfstudio.effects.effect import Effect
 from pgsd_nerfstudio.physics.clock import domain_of
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.answer import Answer
+from pgsd_nerfstudio.response.casting import casting
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edited import edits_key, fit_edits
 from pgsd_nerfstudio.response.edited_pictures import read_edited
@@ -23,6 +24,7 @@ from pgsd_nerfstudio.response.layer import Layer
 from pgsd_nerfstudio.response.layer_making import layer_of
 from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.puddle_making import puddles_of, stored_water, water_of
+from pgsd_nerfstudio.response.rays import open_sky, ray_starts
 from pgsd_nerfstudio.response.shadow_borders import Shade, plausible, seen_by_colors, sun_colors
 from pgsd_nerfstudio.response.sky import sky_share
 from pgsd_nerfstudio.response.sunlight import Sunlight, find_sunlight, lit, overcast_factor
@@ -34,8 +36,9 @@ from pgsd_nerfstudio.storage import cache_dir, content_key, load_tensors, save_t
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
+SKY_RAYS = 24  # per Gaussian, for the light of the sky under which shadows are compared
 MOST_SOFTENING = 8.0  # greatest factor and, inverse, least; shadows hold noise, which would be too bright with more
-_REVISION = 9  # of the computation; stored answers of another revision are not used
+_REVISION = 10  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
@@ -64,7 +67,7 @@ def answer_of(
         metric = to_metric(scene)
         exposure = Exposure.of(metric, surface, effect, seed=seed)
         sky = sky_of(scene, metric)
-        softening = softening_of(metric, exposure, surface, effect, sky)
+        softening = softening_of(metric, exposure, surface, effect, sky, seed=seed)
         layer = layer_of(scene, metric, surface, effect, seed=seed)
         # Mirrors show the surroundings without the shadows that the clouds take.
         clouded = metric if softening is None else replace(metric, colors=encoded(linear(metric.colors) * softening))
@@ -220,7 +223,7 @@ def to_metric(scene: Scene) -> Gaussians:
 
 
 def softening_of(
-    metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect, sky: Float[Tensor, " n"]
+    metric: Gaussians, exposure: Exposure, surface: SurfaceMesh, effect: Effect, sky: Float[Tensor, " n"], *, seed: int = 0
 ) -> Float[Tensor, "n 3"] | None:
     """Factors on linear red, green and blue in full weather, when the clouds of the ambience take the sun.
 
@@ -230,22 +233,25 @@ def softening_of(
         surface: mesh of the scene in metres.
         effect: its ambience gives the clouds.
         sky: share of each Gaussian that is sky, which no sun shines on.
+        seed: of the rays.
 
     Returns:
         None if the effect has no clouds or no sun was found.
     """
     if effect.ambience is None or effect.ambience.clouds == 0:
         return None
-    sun = sun_of(metric, exposure, surface)
+    mesh = casting(surface, metric)
+    sun = sun_of(metric, exposure, mesh)
     if sun is None:
         return None
-    light, solid = linear(metric.colors), metric.opacities > SOLID
-    by_mesh = lit(sun, metric.means, exposure.normals, surface)
-    shade = Shade.of(sun, metric.means, exposure.normals, light, by_mesh, exposure.sky, solid)
+    light, starts = linear(metric.colors), ray_starts(metric.means, exposure.normals, mesh)
+    opened, _ = open_sky(starts, exposure.normals.cpu(), mesh, SKY_RAYS, torch.Generator().manual_seed(seed))
+    by_mesh = lit(sun, metric.means, exposure.normals, mesh)
+    shade = Shade.of(sun, metric.means, exposure.normals, light, by_mesh, opened, metric.opacities > SOLID)
     ratios = sun_colors(shade, ~exposure.loose & (exposure.level > LEVEL), sun)
     share = seen_by_colors(shade, ratios)
     clouds, seen = effect.ambience.clouds, shade.cosines * share
-    factors = [overcast_factor(replace(sun, ratio=ratio), seen, exposure.sky, clouds) for ratio in ratios.tolist()]
+    factors = [overcast_factor(replace(sun, ratio=ratio), seen, opened, clouds) for ratio in ratios.tolist()]
     found = torch.stack(factors, dim=1) * plausible(shade, ratios, share)[:, None] ** clouds
     return torch.lerp(found.clamp(1 / MOST_SOFTENING, MOST_SOFTENING), torch.ones(3), sky[:, None])
 
