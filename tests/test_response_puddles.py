@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pgsd_nerfstudio.effects import RAINFALL, InitialLook, ParticleLook
-from pgsd_nerfstudio.physics.bodies import DRIPPED, SPLASHED
+from pgsd_nerfstudio.physics.bodies import DRIPPED, SLID, SPLASHED
 from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
 from pgsd_nerfstudio.physics.laws.water_waves import crater_depth, elevation
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -231,16 +231,16 @@ def test_the_water_of_a_crown_shows_half_of_the_ground_and_half_of_the_sky():
 
 
 @pytest.mark.mistyped
-def test_what_drips_is_seen_at_its_own_size_and_what_falls_at_its_legible_one():
-    kinds = torch.tensor([0, SPLASHED, DRIPPED, DRIPPED | SPLASHED], dtype=torch.uint8)
-    history = SimpleNamespace(kinds=kinds, collided=torch.zeros(4, dtype=torch.bool))
-    look = ParticleLook(torch.ones(4), torch.full((4, 3), 0.006), torch.ones(4, 3))
+def test_what_drips_or_slides_is_seen_at_its_own_size_and_what_falls_at_its_legible_one():
+    kinds = torch.tensor([0, SPLASHED, DRIPPED, DRIPPED | SPLASHED, SLID], dtype=torch.uint8)
+    history = SimpleNamespace(kinds=kinds, collided=torch.zeros(5, dtype=torch.bool))
+    look = ParticleLook(torch.ones(5), torch.full((5, 3), 0.006), torch.ones(5, 3))
     appearance = replace(RAINFALL.appearance, legibility=4.0, nearness=2.25)
     answer = SimpleNamespace(
         effect=replace(RAINFALL, appearance=appearance), exposure=SimpleNamespace(loose=torch.zeros(1, dtype=torch.bool))
     )
     found = in_place(InitialLook(look, look, 0.0), history, answer, _ground(2)).active
-    assert found.scales[:, 0].tolist() == pytest.approx([0.006, 0.006, 0.002, 0.006])
+    assert found.scales[:, 0].tolist() == pytest.approx([0.006, 0.006, 0.002, 0.006, 0.002])
 
 
 def test_a_part_of_the_scene_keeps_its_own_puddles():

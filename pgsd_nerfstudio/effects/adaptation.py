@@ -15,9 +15,9 @@ class Adaptation:
     wind_across: bool = False
     """Whether the wind blows across the view from left to right, where it is seen; else in the direction of the wind."""
     air: float | None = None
-    """Snow and rain: metres of air before what cameras see for which the legibility was chosen, on average over pixels. Where a
-    scene has less, fewer particles are seen, and each is drawn with so many times more of its area. None: the legibility is
-    that of the appearance."""
+    """Snow, rain and sand: metres of air before what cameras see for which the legibility was chosen, on average over pixels.
+    Where a scene has less, fewer particles are seen, and each is drawn with so many times more of its area. None: the
+    legibility is that of the appearance."""
 
     def __post_init__(self) -> None:
         if self.visibility is not None and not 0.2 <= self.visibility <= 100:

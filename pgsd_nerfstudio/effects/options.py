@@ -103,8 +103,8 @@ class EffectOptions:
     By default the effect's own, which for snow is 0, no motion blur."""
     legibility: float | None = None
     """Factor on the area of all that flies, 1-1000. At 1 it takes as much light as in nature: right for data sets and for
-    comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking, and for snow and rain more
-    where a scene has little air before its background; said if it is not 1."""
+    comparisons, but rain is then next to invisible. By default the effect's own, chosen by looking, and more where a
+    scene has little air before its background; said if it is not 1."""
 
     def __post_init__(self) -> None:
         # Stored options, and the commands that are made of them, have one name for one weather.

@@ -19,7 +19,7 @@ SANDSTORM = register(
     Effect(
         name="sandstorm",
         emission=Emission(
-            kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=2.5, most=40_000, share=0.1
+            kind="sand grains", intensity=30.0, smallest=0.1e-3, largest=1e-3, importance=5.0, most=60_000, share=0.1
         ),
         material=QUARTZ,
         wind=Wind(speed=9.0, gustiness=0.3, gust_seconds=3.0, turbulence=0.9, largest_eddy=4.0, smallest_eddy=0.5, flutter=0.0),
@@ -40,20 +40,20 @@ SANDSTORM = register(
         appearance=Appearance(
             active=StateLook(
                 scale_per_diameter=(0.36, 0.36, 0.36),
-                scale_spread=0.5,
+                scale_spread=0.0,
                 opacity=0.97,
                 opacity_spread=0.0,
-                rgb=(0.98, 0.86, 0.66),
+                rgb=(1.0, 0.95, 0.82),
                 tone_spread=0.20,
             ),
             collided=StateLook(
                 scale_spread=0.4, opacity=0.35, opacity_spread=0.2, rgb=(0.80, 0.66, 0.46), tone_spread=0.08, settle_seconds=0.4
             ),
-            legibility=1000.0,
+            legibility=300.0,
             exposure=1 / 50,
         ),
-        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.3, patch_size=16.0),
-        adaptation=Adaptation(visibility=2.0, wind_across=True),
+        haze=Haze(rgb=(0.74, 0.58, 0.38), patchiness=0.25, patch_size=32.0),
+        adaptation=Adaptation(visibility=2.0, wind_across=True, air=4.0),
         ambience=Ambience(clouds=0.9, stops=-0.4, tint=(1.12, 0.98, 0.74), saturation=0.9, sky=(0.74, 0.58, 0.38)),
         prompt="A sandstorm sweeps through {scene}, sand grains fly in the wind, dust hangs in the air and sand settles on "
         "surfaces. Photorealistic, high detail",

@@ -1,4 +1,4 @@
-"""Particles in the light of the weather, drips at their own size, and collided ones where they can lie.
+"""Particles in the light of the weather, slow ones at their own size, and collided ones where they can lie.
 
 Like the cover around them, collided particles are darker under less sky. Where the layer of cover lies they vanish in it, and
 none is shown on what is too steep to hold it, in shelter from what falls, or on shreds of the surface that nothing carries.
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.effects.appearance import InitialLook
 from pgsd_nerfstudio.effects.timeline import Timeline
-from pgsd_nerfstudio.physics.bodies import DRIPPED, SPLASHED
+from pgsd_nerfstudio.physics.bodies import DRIPPED, SLID, SPLASHED
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.response.answer import Answer
@@ -43,7 +43,7 @@ def in_place(look: InitialLook, history: ParticleHistory, answer: Answer, metric
         answer: tells which share of the sky each frozen Gaussian sees, and where the layer lies.
         metric: the Gaussians of `answer` in metres.
     """
-    look = _drips(_under_clouds(look, answer), history, answer)
+    look = _slow_ones(_under_clouds(look, answer), history, answer)
     known = (~answer.exposure.loose).nonzero()[:, 0].cpu()
     collided = history.collided.nonzero()[:, 0].cpu()
     if answer.effect.surface.landing != "stays" or len(known) == 0 or len(collided) == 0:
@@ -78,12 +78,14 @@ def _under_clouds(look: InitialLook, answer: Answer) -> InitialLook:
     return replace(look, active=replace(look.active, rgb=encoded(own / white * light).clamp_max(1.0)))
 
 
-def _drips(look: InitialLook, history: ParticleHistory, answer: Answer) -> InitialLook:
-    """Drops that come loose from an edge are slow, large and round: they are drawn at their own size at any legibility."""
-    if answer.effect.surface.landing != "wets":
+def _slow_ones(look: InitialLook, history: ParticleHistory, answer: Answer) -> InitialLook:
+    """Drops that come loose from an edge, and grains and flakes that slide, are slow and not smeared, so that they are seen at
+    their own size; drawn as legibly as what flies they would be balls of centimetres."""
+    factor = answer.effect.appearance.area_factor
+    if factor == 1:
         return look
-    dripped = ((history.kinds & DRIPPED) > 0) & ((history.kinds & SPLASHED) == 0)
-    scales = torch.where(dripped[:, None], look.active.scales / answer.effect.appearance.area_factor**0.5, look.active.scales)
+    slow = ((history.kinds & (DRIPPED | SLID)) > 0) & ((history.kinds & SPLASHED) == 0)
+    scales = torch.where(slow[:, None], look.active.scales / factor**0.5, look.active.scales)
     return replace(look, active=replace(look.active, scales=scales))
 
 
