@@ -8,14 +8,14 @@ slower.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from pgsd_nerfstudio.effects.effect import Effect
-from pgsd_nerfstudio.physics.air.airborne import Flutter, advance, air_velocity
+from pgsd_nerfstudio.physics.air.airborne import Flutter, Instant, advance, air_velocity
 from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.air.emitters import Newcomers, Sizes, fill, outside
 from pgsd_nerfstudio.physics.air.foresight import foresee
@@ -45,6 +45,8 @@ class Air:
     step: float
     """Seconds from frame to frame."""
     seed: int
+    _kept: dict[tuple[float, float], Instant] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """The wind at the times to which newcomers are led."""
 
     def draws(self, frame: int, purpose: int = 0x5704) -> np.random.Generator:
         """Random numbers that depend on the seed, the frame and the purpose alone, not on how the run reached the frame.
@@ -175,7 +177,8 @@ class Air:
         """Of new particles those that will be seen, from when on they will; all of them where distance does not matter."""
         if self.sizes.sharpness is None:
             return new
-        return foresee(new, frame, step=self.step, wind=self.wind, domain=self.domain, sight=self.sight)
+        where = {"domain": self.domain, "sight": self.sight}
+        return foresee(new, frame, step=self.step, wind=self.wind, kept=self._kept, **where)
 
     def unhidden(self, late: Bodies, frame: int) -> Bodies:
         """Of particles that waited those that nothing held up on their way.

@@ -22,8 +22,8 @@ from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import GRAVITY
 from pgsd_nerfstudio.physics.laws.boundary_layer import CALM
 
-# sin(pi r) for |r| <= 1/2 as r times a polynomial of r^2, and cos(pi r) as one, errors below 4e-9 and 3e-10: written out so that
-# loops vectorise.
+# For |r| <= 1/2 sin(pi r) is r times a polynomial of r^2, and cos(pi r) is one, with errors below 4e-9 and 3e-10. They are
+# written out so that loops vectorise.
 _SINE = (3.1415925798039193, -5.167706866061563, 2.550031191732045, -0.5980441830182845, 0.07721836436962909)
 _COSINE = (
     0.999999999779958,
@@ -35,6 +35,9 @@ _COSINE = (
 )
 BLOCK = 64  # particles whose turbulence is summed together, mode by mode; a vector holds sixteen
 
+KEPT = 32  # steps whose wind is kept
+Instant = tuple[ndarray | tuple[np.floating, ...] | None, ...]
+"""Modes, constants, polynomials and obstacles as the kernel takes them."""
 SETTLE = 1e-3  # s; a thousand of the shortest relaxation times in the kernel
 
 
@@ -64,6 +67,7 @@ def advance(
     wind: WindField,
     time: float,
     step: float,
+    kept: dict[tuple[float, float], Instant] | None = None,
 ) -> None:
     """Advance all particles by one step.
 
@@ -75,31 +79,32 @@ def advance(
         wind: the moving air.
         time: s, at the start of the step.
         step: s.
+        kept: takes what this step needs of the wind and hands it to later ones of the same time, step and precision; None: it
+            is made anew.
     """
-    number = position.dtype.type
-    middle = time + 0.5 * step
+    found = None if kept is None else kept.get((time, step))
+    if found is None:
+        found = _instant(wind, time, step, position.dtype)
+        if kept is not None:
+            while len(kept) >= KEPT:
+                del kept[next(iter(kept))]
+            kept[time, step] = found
+    _advance(position, velocity, speed, flutter.speed, flutter.hertz, flutter.phase, *found)
+
+
+def _instant(wind: WindField, time: float, step: float, dtype: np.dtype) -> Instant:
+    """What the kernel needs of a wind for a step."""
+    number, middle = dtype.type, time + 0.5 * step
     mean = wind.at_reference(middle)
     profile = 1.0 / math.log1p(wind.reference_height / wind.roughness)
     constants = np.array(
-        [step, middle, mean[0] * profile, mean[1] * profile, wind.roughness, CALM, GRAVITY, 0.5, 1.0, 1e-6],
-        position.dtype,
+        [step, middle, mean[0] * profile, mean[1] * profile, wind.roughness, CALM, GRAVITY, 0.5, 1.0, 1e-6], dtype
     )
     modes = np.concatenate([wind.waves, wind.swirls, wind.potentials, wind.phases_at(middle)[:, None]], 1)
     if len(modes) % 2:  # the kernel takes two at once
         modes = np.concatenate([modes, np.zeros_like(modes[:1])])
-    _advance(
-        position,
-        velocity,
-        speed,
-        flutter.speed,
-        flutter.hertz,
-        flutter.phase,
-        np.ascontiguousarray(modes.T, dtype=position.dtype),
-        constants,
-        tuple(number(value) for value in _SINE),
-        tuple(number(value) for value in _COSINE),
-        *_obstacles(wind, mean, position.dtype),
-    )
+    polynomials = tuple(number(value) for value in _SINE), tuple(number(value) for value in _COSINE)
+    return np.ascontiguousarray(modes.T, dtype=dtype), constants, *polynomials, *_obstacles(wind, mean, dtype)
 
 
 def air_velocity(points: Float[ndarray, "n 3"], wind: WindField, time: float) -> Float[ndarray, "n 3"]:

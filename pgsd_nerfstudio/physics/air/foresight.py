@@ -14,7 +14,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from pgsd_nerfstudio.physics.air.airborne import Flutter, advance
+from pgsd_nerfstudio.physics.air.airborne import Flutter, Instant, advance
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import NO_END, Bodies
@@ -22,10 +22,20 @@ from pgsd_nerfstudio.physics.clock import Domain
 
 STRIDE = 1.2  # m; about the longest way of a step
 MOST_FRAMES = 10  # of a step
+_NEEDED = ("positions", "velocities", "speeds", "sways", "hertz", "phases", "reaches")
 HORIZON = 60.0  # s; particles that are still on their way then are simulated to the end
 
 
-def foresee(bodies: Bodies, frame: int, *, step: float, wind: WindField, domain: Domain, sight: Sight) -> Bodies:
+def foresee(
+    bodies: Bodies,
+    frame: int,
+    *,
+    step: float,
+    wind: WindField,
+    domain: Domain,
+    sight: Sight,
+    kept: dict[tuple[float, float], Instant] | None = None,
+) -> Bodies:
     """Lead particles along their way; those that will not be seen drop out.
 
     Args:
@@ -35,6 +45,7 @@ def foresee(bodies: Bodies, frame: int, *, step: float, wind: WindField, domain:
         wind: the moving air.
         domain: where it ends, so do they.
         sight: where cameras see, from which distance.
+        kept: of `airborne.advance`; steps of particles of different frames often take place at the same times.
 
     Returns:
         The particles that will be seen, with `since` and `until`, and their positions and velocities in the frame `since`.
@@ -45,44 +56,61 @@ def foresee(bodies: Bodies, frame: int, *, step: float, wind: WindField, domain:
     speed = float(np.linalg.norm(bodies.velocities, axis=1).max())
     frames = int(np.clip(STRIDE / max(speed * step, 1e-6), 1, MOST_FRAMES))
     first, last = np.full(count, NO_END, np.int32), np.full(count, -1, np.int32)
-    began = bodies.positions.copy(), bodies.velocities.copy()
-    under_way, moving, now = np.arange(count), Bodies.join([bodies]), frame
-    while len(under_way) and (now - frame) * step < HORIZON:
-        before, speeds = moving.positions.copy(), moving.velocities.copy()
-        flutter = Flutter(moving.sways, moving.hertz, moving.phases)
-        advance(moving.positions, moving.velocities, moving.speeds, flutter, wind, now * step, frames * step)
-        seen = _watch(before, moving.positions, moving.reaches, sight.seen_distances, sight.lower, 1 / sight.cell)
-        fresh = seen & (first[under_way] == NO_END)
-        new = under_way[fresh]
-        first[new], began[0][new], began[1][new] = now, before[fresh], speeds[fresh]
-        last[under_way[seen]] = now + frames
-        now += frames
-        inside = domain.contains(moving.positions)
-        under_way, moving = under_way[inside], moving.select(inside)
-    last[under_way] = np.where(first[under_way] == NO_END, -1, NO_END)
+    begins = bodies.positions.copy(), bodies.velocities.copy()
+    under_way, now = np.arange(count, dtype=np.int32), frame
+    moving = tuple(getattr(bodies, name).copy() for name in _NEEDED)
+    box = np.asarray(domain.lower, np.float32), np.asarray(domain.upper, np.float32)
+    cells = np.ascontiguousarray(sight.seen_distances), sight.lower, 1 / sight.cell
+    while count and (now - frame) * step < HORIZON:
+        positions, velocities, speeds, sways, hertz, phases, _ = (values[:count] for values in moving)
+        before = positions.copy(), velocities.copy()
+        ahead = frames - now % frames  # to a frame at which steps of all particles end, so that the wind is needed at few times
+        advance(positions, velocities, speeds, Flutter(sways, hertz, phases), wind, now * step, ahead * step, kept)
+        count = _watch(count, *moving, *before, *cells, *box, under_way, now, ahead, first, last, *begins)
+        now += ahead
+    still = under_way[:count]
+    last[still] = np.where(first[still] == NO_END, -1, NO_END)
     matters = last >= 0
     until = np.minimum(last.astype(np.int64) + frames, NO_END).astype(np.int32)
-    return replace(bodies, positions=began[0], velocities=began[1], since=first, until=until).select(matters)
+    return replace(bodies, positions=begins[0], velocities=begins[1], since=first, until=until).select(matters)
 
 
 @numba.njit(cache=True, nogil=True)
-def _watch(before, after, reaches, seen, lower, inverse):
-    """Whether the straight way of each particle comes through a cell that a camera sees within its reach."""
-    found = np.zeros(len(before), np.bool_)
+def _watch(
+    count, positions, velocities, speeds, sways, hertz, phases, reaches,
+    before, had, seen, corner, inverse, lower, upper, under_way, now, frames, first, last, began, began_with,
+):  # fmt: skip
+    """Note which particles come through a cell that a camera sees within their reach, on a straight way.
+
+    Those that leave the domain are taken out, in place; returns how many are left.
+    """
     edge = 1.0 / max(inverse[0], inverse[1], inverse[2])
-    for i in range(len(before)):
+    nx, ny, nz = seen.shape
+    stays = 0
+    for i in range(count):
         x, y, z = before[i, 0], before[i, 1], before[i, 2]
-        way_x, way_y, way_z = after[i, 0] - x, after[i, 1] - y, after[i, 2] - z
+        way_x, way_y, way_z = positions[i, 0] - x, positions[i, 1] - y, positions[i, 2] - z
         pieces = int(np.sqrt(way_x * way_x + way_y * way_y + way_z * way_z) / edge) + 1
+        x, y, z = (x - corner[0]) * inverse[0], (y - corner[1]) * inverse[1], (z - corner[2]) * inverse[2]
+        share = 1.0 / pieces
+        way_x, way_y, way_z = share * way_x * inverse[0], share * way_y * inverse[1], share * way_z * inverse[2]
         for piece in range(pieces + 1):
-            share = piece / pieces
-            a = int(np.floor((x + share * way_x - lower[0]) * inverse[0]))
-            b = int(np.floor((y + share * way_y - lower[1]) * inverse[1]))
-            c = int(np.floor((z + share * way_z - lower[2]) * inverse[2]))
-            a = min(max(a, 0), seen.shape[0] - 1)
-            b = min(max(b, 0), seen.shape[1] - 1)
-            c = min(max(c, 0), seen.shape[2] - 1)
+            a = min(int(max(x + piece * way_x, 0.0)), nx - 1)
+            b = min(int(max(y + piece * way_y, 0.0)), ny - 1)
+            c = min(int(max(z + piece * way_z, 0.0)), nz - 1)
             if seen[a, b, c] <= reaches[i]:
-                found[i] = True
+                own = under_way[i]
+                if first[own] == NO_END:
+                    first[own] = now
+                    for axis in range(3):
+                        began[own, axis], began_with[own, axis] = before[i, axis], had[i, axis]
+                last[own] = now + frames
                 break
-    return found
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        if x >= lower[0] and y >= lower[1] and z >= lower[2] and x <= upper[0] and y <= upper[1] and z <= upper[2]:
+            for axis in range(3):
+                positions[stays, axis], velocities[stays, axis] = positions[i, axis], velocities[i, axis]
+            speeds[stays], sways[stays], hertz[stays], phases[stays] = speeds[i], sways[i], hertz[i], phases[i]
+            reaches[stays], under_way[stays] = reaches[i], under_way[i]
+            stays += 1
+    return stays
