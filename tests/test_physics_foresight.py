@@ -39,7 +39,7 @@ def falling(heights: np.ndarray, speed: float, reach: float) -> Bodies:
     return Bodies(**values)
 
 
-@pytest.mark.parametrize(("speed", "frames"), [(1.0, 10), (8.0, 3)])
+@pytest.mark.parametrize(("speed", "frames"), [(1.0, 12), (8.0, 3)])
 def test_a_fall_through_a_layer_matters_from_before_it_until_after_it(speed, frames):
     bodies = falling(np.array([3.9, 2.5, 1.5]), speed, 2.0)
     settings = {"step": 0.04, "wind": WindField.draw(STILL, 0), "domain": DOMAIN, "sight": layer(1.0, 2.0, 1.5)}

@@ -3,8 +3,8 @@
 The wind of a run is known in advance. Each particle that enters is led along its way by a few long steps; the exact drag of
 `airborne` allows that. Where its way comes into a camera's view within its reach, the particle is simulated from shortly before
 that until shortly after the last such moment; otherwise not at all. Until then it waits. Long steps pass through the turbulence
-less finely than frames do: over the way of a flake through a box of some metres both end within some centimetres of each other,
-and the views are widened by half a metre for it.
+less finely than frames do, and without the flutter, whose circles are small and would alias: over the way of a flake of some
+metres both end within about a decimetre of each other (root mean square), and the views are widened by half a metre for it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pgsd_nerfstudio.physics.bodies import NO_END, Bodies
 from pgsd_nerfstudio.physics.clock import Domain
 
 STRIDE = 1.2  # m; about the longest way of a step
-MOST_FRAMES = 10  # of a step
-_NEEDED = ("positions", "velocities", "speeds", "sways", "hertz", "phases", "reaches")
+MOST_FRAMES = 12  # of a step
+_NEEDED = ("positions", "velocities", "speeds", "reaches")
 HORIZON = 60.0  # s; particles that are still on their way then are simulated to the end
 
 
@@ -60,12 +60,13 @@ def foresee(
     under_way, now = np.arange(count, dtype=np.int32), frame
     moving = tuple(getattr(bodies, name).copy() for name in _NEEDED)
     box = np.asarray(domain.lower, np.float32), np.asarray(domain.upper, np.float32)
-    cells = np.ascontiguousarray(sight.seen_distances), sight.lower, 1 / sight.cell
+    distances = np.ascontiguousarray(sight.seen_distances), np.ascontiguousarray(sight.needed_distances)
+    cells = *distances, sight.lower, 1 / sight.cell
     while count and (now - frame) * step < HORIZON:
-        positions, velocities, speeds, sways, hertz, phases, _ = (values[:count] for values in moving)
+        positions, velocities, speeds, _ = (values[:count] for values in moving)
         before = positions.copy(), velocities.copy()
         ahead = frames - now % frames  # to a frame at which steps of all particles end, so that the wind is needed at few times
-        advance(positions, velocities, speeds, Flutter(sways, hertz, phases), wind, now * step, ahead * step, kept)
+        advance(positions, velocities, speeds, Flutter.none(count), wind, now * step, ahead * step, kept)
         count = _watch(count, *moving, *before, *cells, *box, under_way, now, ahead, first, last, *begins)
         now += ahead
     still = under_way[:count]
@@ -75,14 +76,20 @@ def foresee(
     return replace(bodies, positions=begins[0], velocities=begins[1], since=first, until=until).select(matters)
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cell(place, count):
+    """The nearest of the cells along an axis; the first for NaN."""
+    return min(int(place), count - 1) if place > 0.0 else 0
+
+
 @numba.njit(cache=True, nogil=True)
 def _watch(
-    count, positions, velocities, speeds, sways, hertz, phases, reaches,
-    before, had, seen, corner, inverse, lower, upper, under_way, now, frames, first, last, began, began_with,
+    count, positions, velocities, speeds, reaches,
+    before, had, seen, needed, corner, inverse, lower, upper, under_way, now, frames, first, last, began, began_with,
 ):  # fmt: skip
     """Note which particles come through a cell that a camera sees within their reach, on a straight way.
 
-    Those that leave the domain are taken out, in place; returns how many are left.
+    Those that leave the domain, or cannot come into view any more, are taken out, in place; returns how many are left.
     """
     edge = 1.0 / max(inverse[0], inverse[1], inverse[2])
     nx, ny, nz = seen.shape
@@ -95,9 +102,7 @@ def _watch(
         share = 1.0 / pieces
         way_x, way_y, way_z = share * way_x * inverse[0], share * way_y * inverse[1], share * way_z * inverse[2]
         for piece in range(pieces + 1):
-            a = min(int(max(x + piece * way_x, 0.0)), nx - 1)
-            b = min(int(max(y + piece * way_y, 0.0)), ny - 1)
-            c = min(int(max(z + piece * way_z, 0.0)), nz - 1)
+            a, b, c = _cell(x + piece * way_x, nx), _cell(y + piece * way_y, ny), _cell(z + piece * way_z, nz)
             if seen[a, b, c] <= reaches[i]:
                 own = under_way[i]
                 if first[own] == NO_END:
@@ -107,10 +112,12 @@ def _watch(
                 last[own] = now + frames
                 break
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        if x >= lower[0] and y >= lower[1] and z >= lower[2] and x <= upper[0] and y <= upper[1] and z <= upper[2]:
+        a, b = _cell((x - corner[0]) * inverse[0], nx), _cell((y - corner[1]) * inverse[1], ny)
+        c = _cell((z - corner[2]) * inverse[2], nz)
+        inside = x >= lower[0] and y >= lower[1] and z >= lower[2] and x <= upper[0] and y <= upper[1] and z <= upper[2]
+        if inside and needed[a, b, c] <= reaches[i]:
             for axis in range(3):
                 positions[stays, axis], velocities[stays, axis] = positions[i, axis], velocities[i, axis]
-            speeds[stays], sways[stays], hertz[stays], phases[stays] = speeds[i], sways[i], hertz[i], phases[i]
-            reaches[stays], under_way[stays] = reaches[i], under_way[i]
+            speeds[stays], reaches[stays], under_way[stays] = speeds[i], reaches[i], under_way[i]
             stays += 1
     return stays
