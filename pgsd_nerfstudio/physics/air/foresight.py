@@ -67,7 +67,8 @@ def foresee(
         before = positions.copy(), velocities.copy()
         ahead = frames - now % frames  # to a frame at which steps of all particles end, so that the wind is needed at few times
         advance(positions, velocities, speeds, Flutter.none(count), wind, now * step, ahead * step, kept)
-        count = _watch(count, *moving, *before, *cells, *box, under_way, now, ahead, first, last, *begins)
+        rest = (*before, *cells, *box, under_way, now, ahead, first, last, *begins)
+        count = _watch(count, *(*moving, *rest))
         now += ahead
     still = under_way[:count]
     last[still] = np.where(first[still] == NO_END, -1, NO_END)

@@ -130,7 +130,7 @@ def mass_consistent(passable: Faces, profile: Float[ndarray, " z"], thickness: F
     fluxes = undisturbed[0] * passed[0], undisturbed[1] * passed[1], undisturbed[2] * passed[2]
     for along in range(2):
         winds = [values[along] for values in fluxes]
-        potential, steps, residual = _potential(*areas, *winds, RESIDUAL, 10 * math.prod(shape))
+        potential, steps, residual = _potential(RESIDUAL, 10 * math.prod(shape), *(*areas, *winds))
         if not residual <= RESIDUAL:
             raise RuntimeError(f"the wind around obstacles is not solved to {RESIDUAL:g} m/s after {steps:,} iterations")
         for axis, wind in enumerate(winds):
@@ -176,7 +176,7 @@ def _reached(open_x, open_y, open_z):
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
-def _potential(area_x, area_y, area_z, wind_x, wind_y, wind_z, tolerance, most):
+def _potential(tolerance, most, area_x, area_y, area_z, wind_x, wind_y, wind_z):
     """Potential whose gradient takes the divergence of a wind away, by conjugate gradients (Hestenes & Stiefel 1952).
 
     They are preconditioned with the diagonal. The areas of faces that air does not pass are 0, and cells that it does not reach
