@@ -67,8 +67,8 @@ def foresee(
         before = positions.copy(), velocities.copy()
         ahead = frames - now % frames  # to a frame at which steps of all particles end, so that the wind is needed at few times
         advance(positions, velocities, speeds, Flutter.none(count), wind, now * step, ahead * step, kept)
-        rest = (*before, *cells, *box, under_way, now, ahead, first, last, *begins)
-        count = _watch(count, *(*moving, *rest))
+        notes = (under_way, first, last, *begins)
+        count = _watch((count, now, ahead), moving, before, cells, box, notes)
         now += ahead
     still = under_way[:count]
     last[still] = np.where(first[still] == NO_END, -1, NO_END)
@@ -84,19 +84,19 @@ def _cell(place, count):
 
 
 @numba.njit(cache=True, nogil=True)
-def _watch(
-    count, positions, velocities, speeds, reaches,
-    before, had, seen, needed, corner, inverse, lower, upper, under_way, now, frames, first, last, began, began_with,
-):  # fmt: skip
+def _watch(numbers, moving, before, cells, box, notes):
     """Note which particles come through a cell that a camera sees within their reach, on a straight way.
 
     Those that leave the domain, or cannot come into view any more, are taken out, in place; returns how many are left.
     """
+    (count, now, frames), (positions, velocities, speeds, reaches), (start, had) = numbers, moving, before
+    (seen, needed, corner, inverse), (lower, upper) = cells, box
+    under_way, first, last, began, began_with = notes
     edge = 1.0 / max(inverse[0], inverse[1], inverse[2])
     nx, ny, nz = seen.shape
     stays = 0
     for i in range(count):
-        x, y, z = before[i, 0], before[i, 1], before[i, 2]
+        x, y, z = start[i, 0], start[i, 1], start[i, 2]
         way_x, way_y, way_z = positions[i, 0] - x, positions[i, 1] - y, positions[i, 2] - z
         pieces = int(np.sqrt(way_x * way_x + way_y * way_y + way_z * way_z) / edge) + 1
         x, y, z = (x - corner[0]) * inverse[0], (y - corner[1]) * inverse[1], (z - corner[2]) * inverse[2]
@@ -109,7 +109,7 @@ def _watch(
                 if first[own] == NO_END:
                     first[own] = now
                     for axis in range(3):
-                        began[own, axis], began_with[own, axis] = before[i, axis], had[i, axis]
+                        began[own, axis], began_with[own, axis] = start[i, axis], had[i, axis]
                 last[own] = now + frames
                 break
         x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
