@@ -33,7 +33,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.fft import next_fast_len
+from scipy.fft import irfftn, next_fast_len, rfftn
 
 from pgsd_nerfstudio.effects.effect import Wind
 from pgsd_nerfstudio.physics.clock import Domain
@@ -282,14 +282,15 @@ def _swept(seen: Float[ndarray, "x y z"], pattern: Bool[ndarray, "dx dy dz"]) ->
     # A displacement d leads from i to i + d in x and y and to i - d in z: a correlation in x and y, a convolution in z. With
     # transforms of 2 n - 1 entries along each axis, those that wrap around the end stay outside of the n that are kept.
     shape = tuple(next_fast_len(2 * count - 1, real=True) or 0 for count in seen.shape)
-    steps = np.fft.rfftn(pattern[::-1, ::-1].astype(float), shape, (0, 1, 2))
+    # Single precision tells 0 from 1 in sums of fewer than a million terms.
+    steps = np.asarray(rfftn(pattern[::-1, ::-1].astype(np.float32), shape))
     kept = tuple(slice(count - 1, 2 * count - 1) for count in seen.shape)
     found = np.full(seen.shape, np.inf, np.float32)
     farthest, distance = float(seen[np.isfinite(seen)].max()), CLOSEST
     while True:
         within = seen <= NEARER * distance
         if within.any():
-            reached = np.fft.irfftn(np.fft.rfftn(within.astype(float), shape, (0, 1, 2)) * steps, shape, (0, 1, 2))
+            reached = np.asarray(irfftn(np.asarray(rfftn(within.astype(np.float32), shape)) * steps, shape))
             needed = reached[kept] > 0.5
             found = np.where(needed & np.isinf(found), np.float32(distance), found)
         if NEARER * distance >= farthest:
