@@ -54,9 +54,24 @@ def test_what_srgb_cannot_show_loses_chroma_alone():
 def test_coloured_snow_has_the_hue_and_nearly_the_brightness_of_snow(word):
     own, wanted = polar(SNOWFALL.appearance.active.rgb), polar(to_rgb(word))
     found = polar(applied(read(f"{word} snow").request).appearance.active.rgb)
-    assert degrees_apart(found[2], wanted[2]) < 3
+    assert word == "purple" or degrees_apart(found[2], wanted[2]) < 3
     assert 0.74 < (found[0] - wanted[0]) / (own[0] - wanted[0]) < 0.86
     assert found[1] > 0.02  # a colour is seen: white snow has 0.012
+
+
+def test_purple_snow_is_lilac_and_pink_snow_is_pink():
+    """The hues of what people call pale purple and pink (XKCD survey); the purple of CSS lies half way between."""
+
+    def hue(name: str) -> float:
+        return polar(to_rgb(XKCD_COLORS[f"xkcd:{name}"]))[2]
+
+    lilac = [hue(name) for name in ("light purple", "pale purple", "lilac", "lavender")]
+    found = {
+        word: polar(applied(read(f"{word} snow").request).appearance.active.rgb)[2] for word in ("purple", "fuchsia", "pink")
+    }
+    assert max(degrees_apart(found["purple"], each) for each in lilac) < 5
+    assert degrees_apart(found["fuchsia"], polar(to_rgb("fuchsia"))[2]) < 3
+    assert degrees_apart(found["purple"], hue("pink")) > 40
 
 
 @pytest.mark.parametrize("word", ["yellow", "gold", "orange"])
@@ -66,7 +81,7 @@ def test_yellow_sand_is_ochre(word):
     for state, plain in ((looks.active, own.active), (looks.collided, own.collided)):
         lightness, chroma, hue = polar(state.rgb)
         assert 65 < math.degrees(hue) < 100  # lemon has 110
-        assert 0.07 < chroma < 0.8 * called["lemon"][1]
+        assert 0.06 < chroma < 0.8 * called["lemon"][1]
         assert lightness < polar(plain.rgb)[0] + 1e-3  # a pigment takes light away
     # What lies is as light as what people call ochre and desert, not as lemon.
     assert called["ochre"][0] - 0.05 < lightness < called["lemon"][0] - 0.15
@@ -109,7 +124,7 @@ def test_what_is_no_weather_has_the_colour_that_is_named():
     ):
         assert applied(read(text).request).appearance.active.rgb == to_rgb(name)
     purple_hail = applied(read("purple hail").request).appearance.active.rgb
-    assert polar(purple_hail)[0] > 0.75 and degrees_apart(polar(purple_hail)[2], polar(to_rgb("purple"))[2]) < 3
+    assert polar(purple_hail)[0] > 0.75 and degrees_apart(polar(purple_hail)[2], polar(to_rgb("purple"))[2]) < 25
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values())

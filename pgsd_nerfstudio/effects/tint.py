@@ -32,6 +32,9 @@ _LAB = np.array(
 )
 _HUELESS = 0.02  # chroma below which a colour names no hue: half a step of 8 bits between channels gives less
 _HUED = 0.06  # chroma from which it is all hue
+_PURPLE, _LILAC = math.radians(328), math.radians(307)
+"""Hue of the purple of CSS, and the mean of what people call light and pale purple, lilac and lavender (XKCD survey)."""
+_LIGHT = 0.7  # lightness of the fuchsia of CSS, which has the hue of purple and is pink when it is paler
 
 
 @dataclass(frozen=True)
@@ -74,9 +77,17 @@ def in_matter(own: Rgb, wanted: Rgb, kind: Kind) -> Rgb:
     kept = 0.5 + (matter.lightness - 0.5) * hued
     if hued:
         target += hued * (min(target, lightness) - target)  # a pigment takes light away
+    towards = _paled(towards, target)
     away = math.remainder(hue - towards, math.tau)
     pull = matter.hue * max(0.0, 1.0 - abs(away) / math.radians(120)) if chroma > _HUELESS else 0.0
     return within_srgb(kept * lightness + (1 - kept) * target, min(colourful, matter.chroma), towards + pull * away)
+
+
+def _paled(hue: float, lightness: float) -> float:
+    """Hue in radians that a dark colour of a hue keeps its name with when it is light: purple is lilac then and not pink."""
+    near = max(0.0, 1.0 - abs(math.remainder(hue - _PURPLE, math.tau)) / math.radians(20))
+    dark = min(max((_LIGHT - lightness) / 0.2, 0.0), 1.0)
+    return hue - near * dark * (_PURPLE - _LILAC)
 
 
 def mixed_evenly(first: Rgb, second: Rgb, share: float) -> Rgb:

@@ -47,18 +47,14 @@ KINDS: dict[str, Kind] = _spread(
     ("snow, snowing, snows, snowfall, snowflake, flake", Kind("snowfall")),
     ("rain, raining, rains, rainfall, raindrop", Kind("rainfall")),
     ("sleet", Kind("rainfall", (0.85, 0.88, 0.92), factors={"opacity": 1.3, "fall_speed": 0.6})),
+    # Stones of ice that lie white on the ground and fall as fast as a request allows.
     (
         "hail, hailstone, hailstorm",
-        Kind(
-            "rainfall",
-            (0.92, 0.94, 0.97),
-            None,
-            {"size": 2.0, "amount": 0.3, "fall_speed": 1.5, "opacity": 2.0, "accumulates": True},
-        ),
+        Kind("snowfall", factors={"amount": 0.8, "size": 1.5, "fall_speed": 3.0, "opacity": 1.5, "tumbling": 0.0}),
     ),
     ("fog, mist", Kind("fog")),
     ("haze", Kind("fog", factors={"amount": 0.3})),
-    ("smoke", Kind("fog", SMOKE, factors={"tumbling": 1.5}, dyed=True)),
+    ("smoke", Kind("fog", SMOKE, factors={"amount": 2.0}, dyed=True)),
     ("smog", Kind("fog", (0.66, 0.61, 0.52), dyed=True)),
     ("steam, vapour, vapor", Kind("fog", (0.96, 0.96, 0.97), factors={"amount": 0.7})),
     ("sand, sandstorm, dust storm, duststorm, haboob", Kind("sandstorm")),
@@ -79,7 +75,13 @@ KINDS: dict[str, Kind] = _spread(
     ),
     ("confetti", _particle(size=1.5, amount=0.6, opacity=1.2, tumbling=3.5, colourful=True, accumulates=False)),
     ("feather", _particle(size=4.0, amount=0.15, fall_speed=0.5, tumbling=2.5)),
-    ("pollen", _particle((0.93, 0.8, 0.25), size=0.5, amount=0.6, fall_speed=0.2, accumulates=False)),
+    # Grains of pollen are far smaller; in sunlight their clumps shine like this.
+    (
+        "pollen",
+        _particle(
+            (1.0, 0.86, 0.25), size=0.7, amount=0.25, fall_speed=0.2, wind=0.5, opacity=1.3, glow=0.15, accumulates=False
+        ),
+    ),
     ("dandelion seed, dandelion, fluff", _particle(size=1.5, amount=0.2, fall_speed=0.4)),
     (
         "dust mote, mote",
@@ -99,7 +101,7 @@ KINDS: dict[str, Kind] = _spread(
     ("rainy, drop, droplet, shower, drizzle, drizzling, downpour, cloudburst, monsoon, pouring", Kind("rainfall", rank=1)),
     ("thunderstorm, rainstorm, hurricane, typhoon", Kind("rainfall", rank=1)),
     ("foggy, misty, hazy, cloudy, cloud", Kind("fog", rank=1)),
-    ("smoky", Kind("fog", SMOKE, rank=1, dyed=True)),
+    ("smoky", Kind("fog", SMOKE, factors={"amount": 2.0}, rank=1, dyed=True)),
     ("sandy, dusty, grain", Kind("sandstorm", rank=1)),
     ("ashy", Kind("snowfall", ASH, None, {"size": 0.8, "fall_speed": 0.5}, 1, True)),
     (
@@ -132,7 +134,8 @@ QUALITIES: dict[str, dict[str, float | bool]] = _spread(
     ("big, large, coarse, chunky, fat, plump", {"size": 1.8}),
     ("huge, giant, gigantic, enormous, massive", {"size": 3.5}),
     ("fluffy", {"size": 1.5, "fall_speed": 0.8, "tumbling": 1.3}),
-    ("sparse, few, scattered, occasional, a few, thin", {"amount": 0.3}),
+    ("sparse, few, scattered, occasional, a few", {"amount": 0.3}),
+    ("thin", {"amount": 0.5}),
     ("light, a little, dusting", {"amount": 0.4}),
     ("faint", {"amount": 0.5, "opacity": 0.6}),
     ("moderate", {"amount": 1.0}),
