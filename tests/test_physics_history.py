@@ -223,8 +223,13 @@ def test_rows_are_placed_by_particle_and_frame_and_wrong_ones_are_refused():
 
     def placed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         rows = zip((0, 2), ids, counts, (first, second), strict=True)
-        chunks = [SimpleNamespace(start=s, row_ids=i, row_counts=c, row_positions=p) for s, i, c, p in rows]
-        return _trajectories(chunks, births, offsets)  # type: ignore[arg-type]
+        chunks = [
+            SimpleNamespace(start=s, births=births if s == 0 else births[:0], row_ids=i, row_counts=c, row_positions=p)
+            for s, i, c, p in rows
+        ]
+        found = _trajectories(chunks, births, offsets)  # type: ignore[arg-type]
+        assert not chunks  # they have been let go
+        return found
 
     expected = at[[0, 2, 4, 1, 3, 5]]  # by particle, then frame
     np.testing.assert_array_equal(placed(at[:3], at[3:]), expected)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Clock
-from pgsd_nerfstudio.physics.record.codec import FINEST, exponent_for
+from pgsd_nerfstudio.physics.record.codec import FINEST, exponent_for, quantised
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.storage import load_tensors, save_tensors
 
@@ -116,11 +116,11 @@ def load_chunk(folder: Path, index: int, start: int, frames: int) -> Chunk | Non
 _REST = {"positions": (3,), "quats": (4,), "extents": (), "covers": ()}
 
 
-def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) -> ParticleHistory:
+def assemble(chunks: list[Chunk], clock: Clock, about: Mapping[str, Any]) -> ParticleHistory:
     """The history of a run.
 
     Args:
-        chunks: all chunks of the run, in order.
+        chunks: all chunks of the run, in order. They are taken out of the list one by one, so that no row is in memory twice.
         clock: frame rate and number of frames.
         about: plain values to keep with the history, which also gets the counts of particles by kind and by how they ended.
     """
@@ -148,7 +148,6 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         "ends": ends,
         "collided": collided,
         "offsets": offsets,
-        "positions": _trajectories(chunks, births, offsets),
         **rest,
         "quats": joined("quats"),
         "diameters": joined("diameters"),
@@ -157,6 +156,7 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
         "kinds": kinds,
     }
     last = chunks[-1].state
+    arrays["positions"] = _trajectories(chunks, births, offsets)
     counts = {name: int((how == code).sum()) for name, code in ENDS.items()}
     counts |= {"emitted": count, "in_air": last.moving, "splashed": int((kinds & SPLASHED > 0).sum())}
     counts |= {"slid": int((kinds & SLID > 0).sum()), "dense": int((kinds & DENSE > 0).sum())}
@@ -164,27 +164,29 @@ def assemble(chunks: Sequence[Chunk], clock: Clock, about: Mapping[str, Any]) ->
     return ParticleHistory(**tensors, fps=clock.fps, frames=clock.frames, about={**about, **counts})
 
 
-def _trajectories(chunks: Sequence[Chunk], births: Int[ndarray, " p"], offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
+def _trajectories(chunks: list[Chunk], births: Int[ndarray, " p"], offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
     """The rows of all chunks ordered by particle and frame, rounded to the lattice of `codec`; NaN where a row is missing.
 
     Raises:
         ValueError: a position is NaN or infinite, or a row belongs to a frame in which its particle is not active.
     """
-    positions = np.full((int(offsets[-1]), 3), np.nan, np.float32)
-    exponent = FINEST
-    while True:  # the lattice is nearly always the finest; where a coordinate is too large for it, the rows are placed again
-        largest = 0.0
-        for chunk in chunks:
-            rows = chunk.row_positions, chunk.row_ids, chunk.row_counts.astype(np.int64)
-            found, bad = _place(positions, *rows, chunk.start, births, offsets, 2.0**-exponent, 2.0**exponent)
-            largest = max(largest, float(found))
-            if bad >= 0:
-                frame = chunk.start + int(np.searchsorted(np.cumsum(chunk.row_counts), bad, side="right"))
-                where = f"in frame {frame}: {chunk.row_positions[bad].tolist()}"
-                raise ValueError(f"the position of particle {chunk.row_ids[bad]} is not finite, or it is not active, {where}")
-        if exponent_for(largest) == exponent:
-            return positions
-        exponent = exponent_for(largest)
+    positions = np.empty((int(offsets[-1]), 3), np.float32)
+    largest, first = 0.0, 0
+    while chunks:
+        chunk = chunks.pop(0)
+        # Particles are numbered as they are born, so that those of a chunk have rows beside each other.
+        born = first + len(chunk.births)
+        positions[offsets[first] : offsets[born]] = np.nan
+        first = born
+        rows = chunk.row_positions, chunk.row_ids, chunk.row_counts.astype(np.int64)
+        found, bad = _place(positions, *rows, chunk.start, births, offsets, 2.0**-FINEST, 2.0**FINEST)
+        largest = max(largest, float(found))
+        if bad >= 0:
+            frame = chunk.start + int(np.searchsorted(np.cumsum(chunk.row_counts), bad, side="right"))
+            where = f"in frame {frame}: {chunk.row_positions[bad].tolist()}"
+            raise ValueError(f"the position of particle {chunk.row_ids[bad]} is not finite, or it is not active, {where}")
+    # The lattice is nearly always the finest. Where a coordinate is too large for it, the rows are rounded to a coarser one.
+    return positions if exponent_for(largest) == FINEST else quantised(positions, offsets)
 
 
 @numba.njit(cache=True, nogil=True)
