@@ -9,7 +9,7 @@ import torch
 from pgsd_nerfstudio.effects import effect
 from pgsd_nerfstudio.response.airlight import thinned
 from pgsd_nerfstudio.response.layer import Layer, upright
-from pgsd_nerfstudio.response.layer_making import Carriers, layer_of
+from pgsd_nerfstudio.response.layer_making import Carriers, borne, layer_of
 from pgsd_nerfstudio.response.light import received
 from pgsd_nerfstudio.response.patchiness import covered_share, fallen_until_hidden, hidden_share, ranks
 from pgsd_nerfstudio.response.prepare import to_metric
@@ -78,6 +78,27 @@ def test_nothing_lies_at_second_0_and_the_layer_begins_as_patches(layer):
 def test_no_layer_lies_on_shreds_of_the_surface_that_no_gaussian_carries(scene):
     assert layer_of(scene, to_metric(scene), square(1.0, height=0.2), SNOW) is None
     assert Carriers.of(torch.tensor([[0.0, 0, 0.2]]), to_metric(scene)).share[0] < 1e-3
+
+
+@pytest.mark.parametrize(("tilt", "share"), [(0.0, 1.0), (60.0, 0.5), (85.0, math.cos(math.radians(85)))])
+def test_a_disc_is_as_level_as_its_area_from_above(tilt, share):
+    half = math.radians(tilt) / 2
+    quat = torch.tensor([[math.cos(half), math.sin(half), 0.0, 0.0]])
+    disc = Gaussians(torch.zeros(1, 3), quat, torch.tensor([[0.02, 0.02, 1e-4]]), torch.ones(1), torch.ones(1, 3))
+    found = Carriers.of(torch.zeros(1, 3), disc).level(disc)
+    assert found.item() == pytest.approx(share, abs=0.01)
+
+
+def test_leaves_on_edge_bear_caps_and_ground_bears_any_cover(scene, layer):
+    """The same floor with its Gaussians set upright: the layer ends at a few millimetres and never closes."""
+    assert layer.bears.isinf().all()
+    upright_quat = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0]).repeat(len(scene.gaussians), 1)
+    leaves = replace(scene, gaussians=replace(scene.gaussians, quats=upright_quat))
+    on_edge = layer_of(leaves, to_metric(leaves), square(1.0), SNOW)
+    assert on_edge is not None
+    assert on_edge.thickness(SNOW, 100.0).max() < 0.0035
+    assert on_edge.grown(SNOW, 100.0)[1].sum() / len(on_edge) < 0.4
+    assert borne(torch.tensor([0.0, 0.5, 0.6, 0.8])).tolist() == pytest.approx([0.003, 0.003, 0.006, math.inf])
 
 
 def test_an_effect_of_which_nothing_stays_has_no_layer(scene, layer):

@@ -12,7 +12,6 @@ atmospheric aerosols", 1980). The colour of the cover in the open is Appearance.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -53,6 +52,8 @@ class Layer:
     """Slope of the bare surface in degrees."""
     rank: Float[Tensor, " l"]
     """Order in which the pieces appear, 0..1."""
+    bears: Float[Tensor, " l"]
+    """Greatest thickness in metres that what lies below can bear: stems and leaves on edge hold little caps and no slab."""
     sky: Float[Tensor, " l"]
     """Share of the sky that a piece sees, weighted by the cosine to its normal."""
     tone: Float[Tensor, " l"]
@@ -96,8 +97,9 @@ class Layer:
         return falling_mass(effect) * (response.accumulation_speedup / response.layer_density) * self.catches * holds
 
     def thickness(self, effect: Effect, seconds: float) -> Float[Tensor, " l"]:
-        """Thickness in metres at a second; a film where the surface is steeper than the angle of repose."""
-        thickest = torch.where(self.slope > effect.surface.repose_degrees, effect.surface.film, math.inf)
+        """Thickness in metres at a second; a film where the surface is steeper than the angle of repose, and no more than it
+        bears."""
+        thickest = torch.where(self.slope > effect.surface.repose_degrees, effect.surface.film, self.bears)
         return torch.minimum(self.rate(effect) * effect.timeline.fallen(seconds), thickest)
 
     def grown(self, effect: Effect, seconds: float) -> tuple[Int[Tensor, " k"], Float[Tensor, " k"], Float[Tensor, " k"]]:

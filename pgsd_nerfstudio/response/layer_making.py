@@ -34,6 +34,8 @@ NEIGHBOURS = 10  # pieces over which the exposure is averaged, which is noisy by
 GRAIN, UNEVEN = 0.035, 0.12  # standard deviations of the logarithms of tone and thickness from piece to piece
 NEAREST = 8  # frozen Gaussians that are asked whether they carry a piece
 CARRIES = 0.25  # sum of their opacities at a piece from which they do
+UPRIGHT = (0.5, 0.7)  # how level what carries is, below which only caps lie on it, and above which any cover
+CAP = 0.003  # m; thickness of a cap on stems and on leaves on edge, a leaf's width or so
 ROUGH = 0.012  # m; how far a surface may be from the Gaussians that it was made from
 
 
@@ -77,6 +79,7 @@ def layer_of(scene: Scene, metric: Gaussians, surface: SurfaceMesh, effect: Effe
         catches=catches * uneven,
         slope=slope,
         rank=ranks(pieces.points, seed),
+        bears=borne(carriers.level(metric)[kept][around].mean(1)),
         sky=sky,
         tone=torch.exp(GRAIN * torch.randn(len(slope), generator=generator)),
         host=host,
@@ -111,11 +114,26 @@ class Carriers(NamedTuple):
         """Index of the Gaussian that is most opaque at each point."""
         return self.near.gather(1, self.there.argmax(1, keepdim=True))[:, 0]
 
+    def level(self, metric: Gaussians) -> Float[Tensor, " n"]:
+        """How level the Gaussians lie, 0..1: their area seen from above, relative to that of their broad side. A stone that
+        lies flat has 1, as does a twig that lies; a stem and a leaf on edge have next to 0."""
+        axes = _axes(metric.quats)
+        cov = (axes * metric.scales[:, None].square()) @ axes.transpose(1, 2)
+        above = (cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1].square()).clamp_min(0.0).sqrt()
+        broad = metric.scales.sort(dim=1).values[:, 1:].prod(1)
+        return (self.there * (above / broad.clamp_min(1e-12))[self.near]).sum(1) / self.share.clamp_min(1e-6)
+
     def settled(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], metric: Gaussians) -> Float[Tensor, "n 3"]:
         """Points moved along their normals onto the mean height of the Gaussians that carry them."""
         heights = ((metric.means[self.near] - points[:, None]) * normals[:, None]).sum(2)
         mean = (self.there * heights).sum(1) / self.share.clamp_min(1e-6)
         return points + mean[:, None] * normals
+
+
+def borne(level: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Greatest thickness in metres of a cover on Gaussians that lie so level; inf where they are ground, table or bench."""
+    low, high = UPRIGHT
+    return CAP / (1 - ((level - low) / (high - low)).clamp(0.0, 1.0))
 
 
 def _axes(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:

@@ -38,7 +38,7 @@ from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 SOLID = 0.3  # opacity from which the colour of a Gaussian counts in the search for the sun
 SKY_RAYS = 24  # per Gaussian, for the light of the sky under which shadows are compared
 MOST_SOFTENING = 8.0  # greatest factor and, inverse, least; shadows hold noise, which would be too bright with more
-_REVISION = 10  # of the computation; stored answers of another revision are not used
+_REVISION = 11  # of the computation; stored answers of another revision are not used
 
 
 def answer_of(
