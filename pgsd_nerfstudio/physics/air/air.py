@@ -213,7 +213,11 @@ class Air:
         found = found.select(now)
         speeds = fall_speed(found.diameters, self.effect.material)
         new = self.newborn(found, self.settled(found.positions, speeds, time), self.draws(frame, ARRIVING))
-        return self._that_matter(new.select(~self.shadowed(found.positions, speeds, time)), frame)
+        new = self._that_matter(new, frame)
+        # Those that wait are looked at when they begin to matter (`unhidden`).
+        due = new.since <= frame
+        due[due] = self.shadowed(new.positions[due], new.speeds[due], time)
+        return new.select(~due)
 
     def _passed_by_front(self, frame: int) -> Bodies:
         """Particles ahead of the front in the frame before and behind it in `frame`."""
