@@ -119,14 +119,16 @@ def changed_rows(prepared: PreparedScene, path: Cameras, view: Cameras, instants
         instants: frames over which shares are averaged.
     """
     for name, (intensity, low, high) in WANTED.items():
-        own = effect(name, intensity=intensity)
+        own, factor = effect(name, intensity=intensity), 0.0
         for kind in (own, own.with_legibility(1.0)):
+            if factor == 1:
+                continue  # the default is nature's own
             weather, asked = weather_along(prepared, kind, path, instants[-1] + 1), kind is own
-            look = weather.effect.appearance
+            factor = weather.effect.appearance.area_factor
             found = 100 * float(np.mean([shown(weather, view, frame).changed for frame in instants]))
             yield Record(
                 f"{name}, {intensity:g} mm/h, {prepared.scene.name}: pixels that flying particles change, "
-                f"{look.area_factor:g} times their area",
+                f"{factor:g} times their area",
                 found,
                 "%",
                 target=f">= {low:g}" if asked else None,
