@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
 PACKAGE = ROOT / "pgsd_nerfstudio"
-BELOW_ALL = ["version", "storage", "refusal", "vectors"]
+BELOW_ALL = ["version", "storage", "refusal", "vectors", "kernels"]
 ROOMS = [
     *("scene", "rendering", "surface", "effects", "physics", "response", "dynamics", "guidance", "weather"),
     *("plugin", "laboratory", "cli"),

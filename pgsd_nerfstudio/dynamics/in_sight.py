@@ -11,7 +11,6 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from pgsd_nerfstudio.dynamics.rollout_frame import RolloutFrame
 from pgsd_nerfstudio.effects.appearance import InitialLook
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.air.reach import FADE
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.rendering.rasterizer import RasterConfig
@@ -164,7 +164,7 @@ def in_sight(
     return torch.from_numpy(active), torch.from_numpy(collided)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_sight(
     births, ends, has_collided, offsets, positions, rest_positions, reaches, frame, active_extents, collided_extents, share, eye
 ):
@@ -205,7 +205,7 @@ def _in_sight(
     return active[:n_active].copy(), collided[:n_collided].copy()
 
 
-@numba.njit(inline="always")
+@kernel(inline="always")
 def _seen(point, reach, extent, way, eye):
     """Whether a ball around a point, of standard deviation `extent` + `way`, touches the picture within reach of the camera."""
     m = eye.viewmat

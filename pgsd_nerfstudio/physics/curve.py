@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+
+from pgsd_nerfstudio.kernels import kernel
 
 
 def along_curve(points: Float[ndarray, "n 3"], lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> Int[ndarray, " n"]:
@@ -20,7 +21,7 @@ def along_curve(points: Float[ndarray, "n 3"], lower: Float[ndarray, "3"], upper
     return np.argsort(_keys(points, lower, 32 / np.maximum(upper - lower, 1e-9)), kind="stable")
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _keys(points, lower, scale):
     keys = np.zeros(len(points), np.uint16)
     for n in range(len(points)):

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-import numba
 import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.bodies import Bodies
 
 SPARE = 1.25  # room for particles, relative to those that are there when it is made
@@ -75,7 +75,7 @@ def _room(like: Bodies, count: int) -> dict[str, ndarray]:
     return {name: np.empty((count, *getattr(like, name).shape[1:]), getattr(like, name).dtype) for name in _NAMES}
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _gather(now, then, stays, wide):
     if wide == 1:
         for k in range(len(stays)):

@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from pgsd_nerfstudio.effects.matter import Material
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.ground.standing_water import StandingWater
 from pgsd_nerfstudio.physics.laws.water_waves import Ring, crater_depth
 from pgsd_nerfstudio.response.impacts import Impacts
@@ -115,7 +115,7 @@ def crests() -> tuple[Float[ndarray, "k t 2"], Float[ndarray, "k t 2"]]:
     return np.stack([radii[first], radii[second]], -1), np.stack([at, beside], -1)
 
 
-@numba.njit(cache=True)
+@kernel()
 def _add(
     points: ndarray, starts: ndarray, lower: ndarray, shape: ndarray,
     places: ndarray, ages: ndarray, depths: ndarray, numbers: ndarray, tables: ndarray,

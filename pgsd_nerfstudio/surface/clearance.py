@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
 CELL = 0.07  # m; smallest edge of a cell
@@ -120,14 +120,14 @@ def cells_of_triangles(
     return _cells_of(vertices, surface.triangles.numpy(force=True), shape)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _longer(values, count):
     grown = np.empty(2 * count + 1024, np.int32)
     grown[: len(values)] = values
     return grown
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _cells_of(vertices, triangles, shape):
     """Cells and owners, see `cells_of_triangles`; vertices in cells.
 
@@ -198,7 +198,7 @@ def _cells_of(vertices, triangles, shape):
     return cells[:count], owners[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _parts(occupied):
     """Clearance of all cells: with d cells from one to the other along an axis, |d| - 1 lie between them.
 
@@ -231,7 +231,7 @@ def _parts(occupied):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _near(start, stop, room, lower, cell, parts):
     found, count = np.empty(len(start), np.int64), 0
     inverse, part = np.float32(1.0 / cell), np.float32(cell / PARTS)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.surface.clearance import PARTS, ROOM
 from pgsd_nerfstudio.surface.smooth_normals import LEAST
 from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
@@ -34,7 +34,7 @@ def grid_of(cells: TriangleCells) -> tuple[np.floating | np.unsignedinteger, ...
     return (low[0], low[1], low[2], np.float32(1 / where.cell), counts[0], counts[1], counts[2])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def corners_of(triangles, f):
     """Where the three corners of triangle f begin in the list of all vertices' coordinates; unsigned indices spare checks."""
     at = np.uint64(3) * np.uint64(f)
@@ -42,14 +42,14 @@ def corners_of(triangles, f):
     return np.uint64(3) * np.uint64(a), np.uint64(3) * np.uint64(b), np.uint64(3) * np.uint64(c)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def difference(vertices, a, b):
     """Vector from one vertex to another; both as of `corners_of`."""
     one, two = np.uint64(1), np.uint64(2)
     return vertices[b] - vertices[a], vertices[b + one] - vertices[a + one], vertices[b + two] - vertices[a + two]
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def met(vertices, a, b, c, x, y, z, dx, dy, dz):
     """Where the line x + t d meets a triangle: t, inf where it does not, and the weights of the second and third corner."""
     bx, by, bz = difference(vertices, a, b)
@@ -67,7 +67,7 @@ def met(vertices, a, b, c, x, y, z, dx, dy, dz):
     return np.inf, u, v
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def first_met(x, y, z, dx, dy, dz, reach, grid, parts, first, members, triangles, vertices):
     """First triangle on the way x + t d up to t = `reach` metres; d is a unit vector.
 
@@ -107,7 +107,7 @@ def first_met(x, y, z, dx, dy, dz, reach, grid, parts, first, members, triangles
     return best, which, best_u, best_v
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _near_triangle(vertices, a, b, c, x, y, z):
     """Weights of the second and third corner at the point of a triangle that is nearest to a point, and its square distance."""
     px, py, pz = x - vertices[a], y - vertices[a + np.uint64(1)], z - vertices[a + np.uint64(2)]
@@ -137,7 +137,7 @@ def _near_triangle(vertices, a, b, c, x, y, z):
     return u, v, rx * rx + ry * ry + rz * rz
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def nearest(x, y, z, reach, grid, first, members, triangles, vertices):
     """Nearest triangle to a point within `reach` metres.
 
@@ -176,7 +176,7 @@ def nearest(x, y, z, reach, grid, first, members, triangles, vertices):
     return math.sqrt(square), which, best_u, best_v
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def blended(values, a, b, c, u, v):
     """Vectors of three vertices blended with these weights of the second and third; the vertices as of `corners_of`."""
     w, one, two = 1.0 - u - v, np.uint64(1), np.uint64(2)
@@ -187,7 +187,7 @@ def blended(values, a, b, c, u, v):
     )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def normal_at(vertices, normals, a, b, c, u, v):
     """Unit normal of the open side, smooth as that of `smooth_normals`."""
     x, y, z = blended(normals, a, b, c, u, v)

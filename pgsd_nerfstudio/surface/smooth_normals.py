@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from pgsd_nerfstudio.kernels import kernel
 
 LEAST = 0.1  # length of the blend of unit normals below which it says nothing
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def vertex_normals(vertices, triangles):
     """Unit normals [v, 3] of vertices: the mean of the adjoining triangles' normals, weighted by area; 0 without any area.
 
@@ -35,7 +36,7 @@ def vertex_normals(vertices, triangles):
     return total
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def smooth_normal(normals, triangles, triangle, u, v, own):
     """One unit normal, float32.
 
@@ -60,7 +61,7 @@ def smooth_normal(normals, triangles, triangle, u, v, own):
     return x * inverse, y * inverse, z * inverse
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def smooth_normals(vertex_normals, triangles, hit, weights, own, which):
     """Unit normals [h, 3] of some hits.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.surface.clearance import Clearance, box_of_cells, cells_of_triangles
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
@@ -51,7 +51,7 @@ class TriangleCells(NamedTuple):
         return TriangleCells(clearance, first, members, triangles, vertices, normals, _across(triangles, len(used)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _listed(cells, owners, cell_count, triangle_count):
     """Sort triangles by cell, and number them in the order in which the cells list them.
 
@@ -70,7 +70,7 @@ def _listed(cells, owners, cell_count, triangle_count):
     return first, members, _in_order(members, triangle_count)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _in_order(numbers, count):
     """Number things in the order in which they are listed, in place; returns the old number of each that is listed."""
     new, order, found = np.full(count, -1, np.int32), np.empty(count, np.int32), 0
@@ -83,7 +83,7 @@ def _in_order(numbers, count):
     return order[:found]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _across(triangles, count):
     """The side of another triangle at each side of a triangle; see `TriangleCells`."""
     first = np.zeros(count + 1, np.int32)  # sides sorted by their lower vertex

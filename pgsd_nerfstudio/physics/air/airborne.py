@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.air.wind import WindField
 from pgsd_nerfstudio.physics.bodies import GRAVITY
 from pgsd_nerfstudio.physics.laws.boundary_layer import CALM
@@ -132,7 +132,7 @@ def _obstacles(wind: WindField, mean: Float[ndarray, "2"], dtype: np.dtype) -> t
     return lattice, nodes, ramp, calmed
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _circle(turns, half, sine, cosine):
     """cos(2 pi turns) and sin(2 pi turns), without branches, from those of half the angle.
 
@@ -146,7 +146,7 @@ def _circle(turns, half, sine, cosine):
     return half + half - double * y, double * x
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _node(place, last, zero):
     """First of the three nodes around a place, and the fraction of the distance to the second; NaN goes to node 0."""
     place = place if place > zero else zero
@@ -155,7 +155,7 @@ def _node(place, last, zero):
     return int(floor), place - floor
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _deflected(nodes, rows, i, j, k, x, y, z, half, one):
     """Change of the mean wind by obstacles: each component is quadratic along its own axis and linear along the others.
 
@@ -182,7 +182,7 @@ def _deflected(nodes, rows, i, j, k, x, y, z, half, one):
     return wind_x, wind_y, wind_z
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _shelter(ramp, i, j, k, x, y, z, half, one):
     """Share of the turbulence that obstacles leave, and its gradient per node: smooth steps between eight nodes."""
     three, six = (one + half) / half, (one + one + one) / half
@@ -203,7 +203,7 @@ def _shelter(ramp, i, j, k, x, y, z, half, one):
     )
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+@kernel(fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _advance(position, velocity, speed, sway, hertz, phase, modes, constants, sine, cosine, lattice, nodes, ramp, calmed):
     step, middle, mean_x, mean_y, roughness, calm_height, gravity, half, one, least = constants
     zero = half - half

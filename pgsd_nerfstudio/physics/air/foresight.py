@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.air.airborne import Flutter, Instant, advance
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.air.wind import WindField
@@ -77,13 +77,13 @@ def foresee(
     return replace(bodies, positions=begins[0], velocities=begins[1], since=first, until=until).select(matters)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _cell(place, count):
     """The nearest of the cells along an axis; the first for NaN."""
     return min(int(place), count - 1) if place > 0.0 else 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _watch(numbers, moving, before, cells, box, notes):
     """Note which particles come through a cell that a camera sees within their reach, on a straight way.
 

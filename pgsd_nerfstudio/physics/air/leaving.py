@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.air.sight import Sight
 from pgsd_nerfstudio.physics.bodies import Bodies
 from pgsd_nerfstudio.physics.clock import Domain
@@ -59,7 +59,7 @@ class Leaving(NamedTuple):
         return Leaving(stays, out, ahead, unseen, broken)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _leaving(positions, velocities, reaches, contacts, lower, upper, passed, over, corner, cell, distances):
     count = len(positions)
     stays, gone, why = np.empty(count, np.uint32), np.empty(count, np.int64), np.empty(count, np.uint8)

@@ -15,12 +15,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh, queries
 
@@ -139,7 +139,7 @@ def mass_consistent(passable: Faces, profile: Float[ndarray, " z"], thickness: F
     return fluxes, (passed[0], passed[1], passed[2])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _reached(open_x, open_y, open_z):
     """Cells [x, y, z] that air from outside of the lattice reaches through passable faces."""
     nx, ny, nz = open_x.shape[0] - 1, open_y.shape[1] - 1, open_z.shape[2] - 1
@@ -175,7 +175,7 @@ def _reached(open_x, open_y, open_z):
     return reached
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@kernel(fastmath={"contract", "reassoc"})
 def _potential(tolerance, most, area_x, area_y, area_z, wind_x, wind_y, wind_z):
     """Potential whose gradient takes the divergence of a wind away, by conjugate gradients (Hestenes & Stiefel 1952).
 

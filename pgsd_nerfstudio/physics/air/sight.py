@@ -29,13 +29,13 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.fft import irfftn, next_fast_len, rfftn
 
 from pgsd_nerfstudio.effects.effect import Wind
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws.boundary_layer import law_of_the_wall
 from pgsd_nerfstudio.scene.cameras import Cameras
@@ -192,7 +192,7 @@ def _views(cameras: Cameras, distance: float, margin: float) -> tuple[Float[ndar
     return planes[first], centers[first]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _see(seen, lower, cell, planes, centers):
     """Lower `seen` [x, y, z], metres, to the distance of a camera from each cell that no plane of its pyramid has outside."""
     half = 0.5 * math.sqrt(cell[0] ** 2 + cell[1] ** 2 + cell[2] ** 2)

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
 
@@ -112,7 +112,7 @@ def _levels(
     return np.concatenate(columns), np.concatenate(heights)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _link(columns, around, reach):
     base, first = columns.base, columns.first
     nx, ny = columns.shape
@@ -142,7 +142,7 @@ def _link(columns, around, reach):
                 columns.beyond[level, k] = under
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _find(points, columns, heights, tolerance):
     lower, cell, base, first = columns.lower, columns.cell, columns.base, columns.first
     nx, ny = columns.shape

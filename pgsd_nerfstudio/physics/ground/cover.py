@@ -13,11 +13,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.columns import Columns
 from pgsd_nerfstudio.physics.ground.toppling import topple
@@ -194,7 +194,7 @@ def _amounts(name: str, values: Float[ndarray, " n"], count: int, unit: str) -> 
     return values
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _level_at(level, i, j, neighbours):
     """Level i and j squares away on the same sheet, reached along diagonals first; negative where the sheet ends before."""
     right = 0 if i > 0 else 2
@@ -207,7 +207,7 @@ def _level_at(level, i, j, neighbours):
     return level
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _spread(level, points, volumes, radii, heights, changed, columns):
     lower, cell = columns.lower, columns.cell
     nx, ny = columns.shape
@@ -238,7 +238,7 @@ def _spread(level, points, volumes, radii, heights, changed, columns):
                 break
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _corners(own, u, v, columns):
     """Levels of the sheet at the four middles of squares around a point, negative where there is none, and their weights."""
     ny = columns.shape[1]
@@ -253,7 +253,7 @@ def _corners(own, u, v, columns):
     return levels, shares
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _read(level, points, heights, columns):
     """Bilinear thickness; where the sheet ends, the existing levels share the weight."""
     found = np.zeros(len(level))
@@ -269,7 +269,7 @@ def _read(level, points, heights, columns):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _slopes(level, points, heights, columns):
     """Rise per run of the top of the cover along x and y: central differences at the middles, bilinear between them."""
     found = np.zeros((len(level), 2))

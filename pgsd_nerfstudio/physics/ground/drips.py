@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.ground.flooding import flood
 from pgsd_nerfstudio.physics.ground.ground_map import heights_below
@@ -103,7 +103,7 @@ def after_film(fallen: float, speedup: float) -> float:
     return max(fallen - FILM / speedup, 0.0)
 
 
-@numba.njit(cache=True)
+@kernel()
 def _over_edges(heights: ndarray, parent: ndarray, order: ndarray) -> ndarray:
     """Number of cells whose water falls over the edge of each cell."""
     n = len(heights)

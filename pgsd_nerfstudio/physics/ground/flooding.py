@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.ground.ground_map import patches
 
 SMALLEST = 0.01  # m^2; smaller hollows hold no water that one would see as a puddle
@@ -46,7 +46,7 @@ def basins_of(
     return number[separate], len(kept)
 
 
-@numba.njit(cache=True)
+@kernel()
 def flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Flood a map from its border, from unknown cells (-inf) and from drains upward.
 
@@ -96,7 +96,7 @@ def flood(heights: ndarray, drains: ndarray) -> tuple[ndarray, ndarray, ndarray]
     return filled.reshape(nx, ny), parent, order
 
 
-@numba.njit(cache=True)
+@kernel()
 def _push(heights: ndarray, cells: ndarray, size: int, height: Any, cell: int) -> int:
     """Add to a binary heap; returns its size."""
     at = size
@@ -110,7 +110,7 @@ def _push(heights: ndarray, cells: ndarray, size: int, height: Any, cell: int) -
     return size + 1
 
 
-@numba.njit(cache=True)
+@kernel()
 def _pop(heights: ndarray, cells: ndarray, size: int) -> int:
     """Remove the lowest of a binary heap; returns its size."""
     size -= 1
@@ -130,7 +130,7 @@ def _pop(heights: ndarray, cells: ndarray, size: int) -> int:
     return size
 
 
-@numba.njit(cache=True)
+@kernel()
 def ways_of(basin: ndarray, parent: ndarray, order: ndarray, rained_on: ndarray, count: int) -> tuple[ndarray, ndarray]:
     """The hollow that each hollow spills into, and the number of cells whose water comes to each first."""
     n = len(order)

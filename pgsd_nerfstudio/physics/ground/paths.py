@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.surface.smooth_normals import smooth_normal
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def rays_along(start, stop, which):
     """Origins and unit directions [r, 6] of rays along some straight paths, and the lengths [r] of the paths, float32.
 
@@ -30,7 +30,7 @@ def rays_along(start, stop, which):
     return rays, lengths
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def within_reach(distances, hit, weights, own, rays, lengths, thickest, grazing, vertex_normals, triangles):
     """Hits that are on their paths, or would be if the surface were raised by the thickest cover.
 

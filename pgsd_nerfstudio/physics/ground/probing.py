@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.surface.short_ways import blended, corners_of, grid_of, nearest, normal_at
 from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
 
@@ -47,7 +47,7 @@ def probed(
     return _probed(np.ascontiguousarray(points, np.float64), rings, SMALLEST * probe, grid_of(cells), *lists)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _probed(points, rings, smallest, grid, first, members, triangles, vertices, vertex_normals, sides):
     count = len(points)
     at, normals = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
@@ -89,13 +89,13 @@ def _probed(points, rings, smallest, grid, first, members, triangles, vertices, 
     return at, normals, extents, owners
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _corner(triangles, f, k):
     """Where corner k of a triangle begins in the list of all vertices' coordinates."""
     return np.uint64(3) * np.uint64(triangles[np.uint64(3 * f + k)])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _walk(f, start, normal, along, across, triangles, vertices, normals, sides, rings, found):
     """Follow the surface from `start` on triangle f in one direction; `found` takes its normals on the rings, or zeros.
 

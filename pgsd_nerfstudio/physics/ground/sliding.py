@@ -10,11 +10,11 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.bodies import GRAVITY, Bodies
 from pgsd_nerfstudio.surface.short_ways import blended, corners_of, first_met, grid_of, nearest, normal_at
 from pgsd_nerfstudio.surface.triangle_cells import TriangleCells
@@ -55,7 +55,7 @@ def slide(bodies: Bodies, ground: TriangleCells, friction: float, step: float) -
     return Slid(moved, rests, flies)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _slide(positions, velocities, speeds, friction, step, grid, parts, first, members, triangles, vertices, normals):
     """Move sliders in place; returns which of them rest and which fly."""
     rests, flies = np.zeros(len(positions), np.bool_), np.zeros(len(positions), np.bool_)
@@ -97,7 +97,7 @@ def _slide(positions, velocities, speeds, friction, step, grid, parts, first, me
     return rests, flies
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _stopped(x, y, z, way_x, way_y, way_z, grid, parts, first, members, triangles, vertices):
     """End of a path: it stops before the first surface, so that no slider crosses one in a corner."""
     length = math.sqrt(way_x * way_x + way_y * way_y + way_z * way_z)
@@ -110,7 +110,7 @@ def _stopped(x, y, z, way_x, way_y, way_z, grid, parts, first, members, triangle
     return x + share * way_x, y + share * way_y, z + share * way_z
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _accelerated(v_x, v_y, v_z, normal, speed, friction, dt):
     """Velocity along a surface after a step of gravity and Coulomb friction; `speed` is not exceeded."""
     n_x, n_y, n_z = normal

@@ -12,15 +12,15 @@ rest without slopes becoming too steep.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.ground.columns import BORDER, WALL
 
 _ROOT = 1.4142135623730951
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _limit_on_sheet(level, heights, columns, steep):
     """Highest top that the sheet's neighbours allow, the two neighbours that limit it, and the share of the second one."""
     limit, side, corner, share = np.inf, -1, -1, 0.0
@@ -45,7 +45,7 @@ def _limit_on_sheet(level, heights, columns, steep):
     return limit, side, corner, share
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _limit_at_end(level, k, heights, columns, steep, film):
     """Highest top that the end of the sheet in direction k allows, and whether the cover beyond reaches up to the edge."""
     kind, beyond = columns.neighbours[level, k], columns.beyond[level, k]
@@ -63,7 +63,7 @@ def _limit_at_end(level, k, heights, columns, steep, film):
     return max(edge, against), against > edge
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _push(level, queue, queued, head, size):
     """Append a level to the ring `queue`; returns the new size."""
     queued[level] = True
@@ -71,7 +71,7 @@ def _push(level, queue, queued, head, size):
     return size + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def topple(start, heights, rested, columns, steep, film, slack, most):
     """Let cover run down.
 

@@ -14,11 +14,11 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.surface.clearance import occupied_cells
 from pgsd_nerfstudio.surface.mesh import SurfaceMesh
@@ -192,7 +192,7 @@ class WetnessGrid:
         return _corners_of(at, self.keys, self._columns, self.shape)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _grow(occupied, near, reach):
     """Mark the cells within `reach` of occupied ones along every axis, which has as many more of them on each side.
 
@@ -222,7 +222,7 @@ def _grow(occupied, near, reach):
     return count
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _lowest(keys, columns, shape, x, y, z):
     """First cell of a column that is not below z; it may be one of the next column."""
     column = x * shape[1] + y
@@ -236,7 +236,7 @@ def _lowest(keys, columns, shape, x, y, z):
     return low
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _beside(keys, columns, shape):
     nx, ny, nz = shape
     found = np.empty((len(keys), 6), np.int32)
@@ -258,14 +258,14 @@ def _beside(keys, columns, shape):
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _add(water, cells, share):
     for n in range(len(cells)):
         for corner in range(8):
             water[cells[n, corner]] += share[n, corner]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _mixed(water, neighbours):
     """Every cell gives a sixth of its water to each existing neighbour and keeps the rest."""
     mixed = np.empty_like(water)
@@ -277,7 +277,7 @@ def _mixed(water, neighbours):
     return mixed
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _corners_of(at, keys, columns, shape):
     nx, ny, nz = shape
     cells, weights = np.zeros((len(at), 8), np.int64), np.zeros((len(at), 8))

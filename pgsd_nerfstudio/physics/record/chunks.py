@@ -7,12 +7,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from pgsd_nerfstudio.kernels import kernel
 from pgsd_nerfstudio.physics.bodies import DENSE, ENDS, SLID, SPLASHED, RunState, with_prefix, without_prefix
 from pgsd_nerfstudio.physics.clock import Clock
 from pgsd_nerfstudio.physics.record.codec import FINEST, exponent_for, quantised
@@ -189,7 +189,7 @@ def _trajectories(chunks: list[Chunk], births: Int[ndarray, " p"], offsets: Int[
     return positions if exponent_for(largest) == FINEST else quantised(positions, offsets)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _place(positions, row_positions, row_ids, row_counts, start, births, offsets, quanta, quantum):
     """Put rounded rows into their places; returns the largest absolute coordinate, and the first row without a place, or -1."""
     largest, row = np.float32(0.0), 0

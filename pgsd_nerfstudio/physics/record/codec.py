@@ -16,10 +16,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+
+from pgsd_nerfstudio.kernels import kernel
 
 FINEST = -14  # binary exponent of the smallest quantum in metres
 MOST = 2**24  # quanta up to which float32 holds every whole number
@@ -50,7 +51,8 @@ def encode(positions: Float[ndarray, "m 3"], offsets: Int[ndarray, " p+1"]) -> S
         ValueError: a position is NaN or infinite, or the offsets do not ascend from 0 to m.
     """
     exponent = _exponent(positions, offsets)
-    return Steps(*_encode(positions, offsets, 2.0**-exponent), exponent)
+    one, two, four = _encode(positions, offsets, 2.0**-exponent)
+    return Steps(one, two, four, exponent)
 
 
 def decode(steps: Steps, offsets: Int[ndarray, " p+1"]) -> Float[ndarray, "m 3"]:
@@ -123,7 +125,7 @@ def _check_offsets(offsets: Int[ndarray, " p+1"], rows: int) -> None:
         raise ValueError(f"offsets must ascend from 0 to {rows}, found {ends}")
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _survey(positions):
     """Largest absolute coordinate, and the first row that is not finite, or -1."""
     largest = 0.0
@@ -136,7 +138,7 @@ def _survey(positions):
     return largest, -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _round(positions, quanta, quantum, rounded):
     for row in range(len(positions)):
         for axis in range(3):
@@ -144,7 +146,7 @@ def _round(positions, quanta, quantum, rounded):
             rounded[row, axis] = np.int64(np.rint(positions[row, axis] * quanta)) * quantum
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _encode(positions, offsets, quanta):
     one = np.empty(3 * len(positions), np.int8)
     two, four = np.empty(8 * len(offsets), np.int16), np.empty(4 * len(offsets), np.int32)
@@ -176,7 +178,7 @@ def _encode(positions, offsets, quanta):
     return one, two[:twos].copy(), four[:fours].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def _decode(one, two, four, offsets, quantum, positions):
     """Decode; the lists must have as many numbers as there are marks."""
     n = twos = fours = 0
