@@ -17,6 +17,7 @@ from plugin_scene import tiny_config, train, write_scene
 import pgsd_nerfstudio
 from pgsd_nerfstudio.cli.main import run
 from pgsd_nerfstudio.laboratory.tiny_cogvideox import write_tiny
+from pgsd_nerfstudio.weather.adapting import adapted
 from pgsd_nerfstudio.weather.options import SimulationOptions
 from pgsd_nerfstudio.weather.stored import StoredWeatherError
 
@@ -162,7 +163,7 @@ def test_making_and_opening_a_weather_draws_nothing_from_the_random_stream_of_tr
 def test_words_become_weather(scene):
     purple = pgsd_nerfstudio.EffectOptions(weather="purple snow")
     made = pgsd_nerfstudio.simulate(scene, purple, seconds=0.2, max_particles=50, progress=False)
-    assert made.effect == purple.resolve()[0] and repr(made).startswith("Weather(snowfall in floor, 0.2 s, ")
+    assert made.effect == adapted(purple.resolve()[0], made.prepared)[0] and repr(made).startswith("Weather(snowfall in floor, 0.2 s, ")
 
 
 def test_pictures_are_png_in_the_folder_that_is_meant(scene, weather, tmp_path: Path, monkeypatch):
