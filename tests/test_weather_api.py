@@ -163,7 +163,8 @@ def test_making_and_opening_a_weather_draws_nothing_from_the_random_stream_of_tr
 def test_words_become_weather(scene):
     purple = pgsd_nerfstudio.EffectOptions(weather="purple snow")
     made = pgsd_nerfstudio.simulate(scene, purple, seconds=0.2, max_particles=50, progress=False)
-    assert made.effect == adapted(purple.resolve()[0], made.prepared)[0] and repr(made).startswith("Weather(snowfall in floor, 0.2 s, ")
+    assert made.effect == adapted(purple.resolve()[0], made.prepared)[0]
+    assert repr(made).startswith("Weather(snowfall in floor, 0.2 s, ")
 
 
 def test_pictures_are_png_in_the_folder_that_is_meant(scene, weather, tmp_path: Path, monkeypatch):
