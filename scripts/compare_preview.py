@@ -92,7 +92,9 @@ class Compare:
         command += ["--seconds", f"{self.seconds:g}", "--frames", str(self.frames), "--max-particles", str(count)]
         command += ["--views", *map(str, self.views)]
         command += ["--width", str(SIDE), "--height", str(SIDE), "--output", str(cache / f"{count}.mp4")]
-        environment = {**os.environ, "PGSD_CACHE": str(cache), "NUMBA_CACHE_DIR": str(cache / "kernels")}
+        # Both keep compiled bytecode, as Python does by default.
+        environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")}
+        environment |= {"PGSD_CACHE": str(cache), "NUMBA_CACHE_DIR": str(cache / "kernels")}
         began = resource.getrusage(resource.RUSAGE_CHILDREN)
         # In the cache's folder, so that each build finds its own package and not the one of the present folder.
         subprocess.run(command, cwd=cache, env=environment, check=True, capture_output=True)
