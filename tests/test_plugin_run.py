@@ -492,7 +492,7 @@ def test_ns_eval_writes_plain_numbers(run: Path, tmp_path: Path):
 def test_ns_export_writes_scene_and_weather_as_one_splat(run: Path, tmp_path: Path):
     from nerfstudio.scripts.exporter import ExportGaussianSplat
 
-    from pgsd_nerfstudio.response.answer import baked
+    from pgsd_nerfstudio.response.baked import baked
     from pgsd_nerfstudio.scene.splats.reading import read_splat
 
     ExportGaussianSplat(load_config=run, output_dir=tmp_path).main()

@@ -14,7 +14,8 @@ from pgsd_nerfstudio.effects.timeline import Timeline
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.rendering.cpu import CpuRasterizer
 from pgsd_nerfstudio.rendering.display import linear
-from pgsd_nerfstudio.response.answer import Answer, baked
+from pgsd_nerfstudio.response.answer import Answer
+from pgsd_nerfstudio.response.baked import baked
 from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.edits import Edits
 from pgsd_nerfstudio.response.exposure import Exposure

@@ -34,7 +34,8 @@ from pgsd_nerfstudio.plugin.splat import splat_tensors
 from pgsd_nerfstudio.plugin.views import BACKGROUND
 from pgsd_nerfstudio.rendering.choice import choose_rasterizer
 from pgsd_nerfstudio.rendering.rasterizer import Rasterizer, Rendering
-from pgsd_nerfstudio.response.answer import Answer, Shown, baked
+from pgsd_nerfstudio.response.answer import Answer, Shown
+from pgsd_nerfstudio.response.baked import baked
 from pgsd_nerfstudio.scene.cameras import Cameras
 from pgsd_nerfstudio.scene.gaussians import Gaussians
 from pgsd_nerfstudio.storage import content_key

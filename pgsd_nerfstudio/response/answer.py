@@ -26,12 +26,10 @@ from pgsd_nerfstudio.response.coating import Coating
 from pgsd_nerfstudio.response.cover_light import cover_light
 from pgsd_nerfstudio.response.exposure import Exposure
 from pgsd_nerfstudio.response.layer import Layer
-from pgsd_nerfstudio.response.light import luminance
 from pgsd_nerfstudio.response.sky import EVEN, overcast, reach
 from pgsd_nerfstudio.response.weather_light import in_weather
 from pgsd_nerfstudio.response.wet_light import darkened, mirrored_sky, under_water, wet_share
 from pgsd_nerfstudio.scene.gaussians import Gaussians, concatenate
-from pgsd_nerfstudio.scene.spherical_harmonics import SH_C0
 
 if TYPE_CHECKING:
     from pgsd_nerfstudio.physics.record.history import ParticleHistory
@@ -305,22 +303,3 @@ def _mapped(record: R, change: Callable[[Tensor], Tensor]) -> R:
     """A copy of a dataclass with `change` applied to its tensors."""
     found = {f.name: getattr(record, f.name) for f in fields(record)}  # type: ignore[arg-type]
     return replace(record, **{name: change(value) for name, value in found.items() if isinstance(value, Tensor)})  # type: ignore[type-var]
-
-
-def baked(shown: Shown | None, frozen: Gaussians) -> Gaussians:
-    """The frozen scene at a moment as a set of Gaussians for files, without mirror and haze, which depend on the camera.
-
-    Args:
-        shown: the answer at the moment; None: no change.
-        frozen: the frozen scene, with spherical harmonics.
-    """
-    if shown is None:
-        return frozen
-    frozen = shown.altered(frozen)
-    constant = 0.5 + SH_C0 * frozen.colors[:, 0]
-    hidden = torch.cat([shown.hidden.to(constant), constant.new_ones(len(frozen) - len(shown.hidden))])
-    after = shown.lit(constant, torch.arange(len(frozen), device=frozen.device), None)
-    dimmed = luminance(after.clamp_min(0)) / luminance(constant.clamp_min(0)).clamp_min(1e-3)
-    left = dimmed.clamp(0, 1) * (1 - hidden)
-    bands = [((after - 0.5) / SH_C0)[:, None], frozen.colors[:, 1:] * left[:, None, None]]
-    return replace(frozen, colors=torch.cat(bands, dim=1))
