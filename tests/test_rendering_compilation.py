@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pgsd_nerfstudio
-from pgsd_nerfstudio.rendering.compilation import aligned, room_stamp, share_out
+from pgsd_nerfstudio.rendering.compilation import aligned, room_stamp, share_out, small_steps, workers
 
 PACKAGE = Path(pgsd_nerfstudio.__file__).parent
 COUNT = """
@@ -82,3 +82,22 @@ def test_the_number_of_threads_does_not_change_the_picture():
     finally:
         torch.set_num_threads(usual)
     assert torch.equal(pictures[0], pictures[1]) and torch.equal(pictures[0], pictures[2])
+
+
+def test_short_steps_get_one_thread_and_kernels_keep_theirs():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with small_steps(1000):
+            assert (torch.get_num_threads(), workers()) == (1, 3)
+            with small_steps(1000):
+                assert (torch.get_num_threads(), workers()) == (1, 3)
+            assert (torch.get_num_threads(), workers()) == (1, 3)
+        assert (torch.get_num_threads(), workers()) == (3, 3)
+        with small_steps(10_000_000):
+            assert (torch.get_num_threads(), workers()) == (3, 3)
+        with pytest.raises(ValueError, match="inside"), small_steps(1000):
+            raise ValueError("inside")
+        assert (torch.get_num_threads(), workers()) == (3, 3)
+    finally:
+        torch.set_num_threads(before)

@@ -10,8 +10,10 @@ do the same for twice the compilation, and its OpenMP threads spin while they wa
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ import torch
 from jaxtyping import Float
 
 from pgsd_nerfstudio import vectors as vectors  # before the first kernel
+
+FEW = 1_000_000  # numbers up to which a step of torch is short
 
 # Reordering and fused operations, but comparisons with NaN and infinity keep their meaning (no "nnan", no "ninf").
 _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
@@ -55,9 +59,35 @@ inlined = partial(numba.njit, inline="always")
 """Decorator of a function whose source numba puts into the kernels that call it, where their options hold for it."""
 
 
+_held: ContextVar[int | None] = ContextVar("threads of the kernels while torch has one", default=None)
+
+
 def workers() -> int:
-    """Number of threads that kernels run on: as many as torch uses."""
-    return torch.get_num_threads()
+    """Number of threads that kernels run on: as many as torch uses, or used before `small_steps`."""
+    return _held.get() or torch.get_num_threads()
+
+
+@contextmanager
+def small_steps(numbers: int) -> Iterator[None]:
+    """While many short steps of torch follow each other, give it one thread; kernels keep theirs.
+
+    A picture is a hundred steps over some 100,000 numbers each. Threads that share such a step mostly wait for each other: they
+    double its CPU time and hardly shorten it.
+
+    Args:
+        numbers: that the largest step works on; if they are many, torch keeps its threads.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1 or numbers > FEW:
+        yield
+        return
+    before = _held.set(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _held.reset(before)
 
 
 def share_out(work: Callable[..., None], count: int, *arguments: object) -> None:

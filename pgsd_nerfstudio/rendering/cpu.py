@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pgsd_nerfstudio.rendering.binning import Binned
-from pgsd_nerfstudio.rendering.compilation import workers
+from pgsd_nerfstudio.rendering.compilation import small_steps, workers
 from pgsd_nerfstudio.rendering.frozen import FrozenView, FrozenViews, View, float_array, motions_array, splat
 from pgsd_nerfstudio.rendering.layers import Layers
-from pgsd_nerfstudio.rendering.moment import Gaps, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
+from pgsd_nerfstudio.rendering.moment import Gaps, Moment, Moments, Viewpoint, backgrounds, moment_per_frame, with_added
 from pgsd_nerfstudio.rendering.projection_gradient import GRADIENT_COLUMNS, project_backward
 from pgsd_nerfstudio.rendering.rasterizer import Dynamic, RasterConfig, Rendering, composite, dynamic_per_frame
 from pgsd_nerfstudio.rendering.walk import blend_at_once, blend_backward, blend_merged
@@ -74,7 +74,12 @@ class CpuRasterizer:
         """As `Rasterizer.render`."""
         if not (torch.isfinite(cameras.viewmats).all() and torch.isfinite(cameras.Ks).all()):
             raise ValueError("the cameras' viewmats and Ks must be finite, found NaN or infinite values")
-        at = moment_per_frame(moments, len(cameras))
+        with small_steps(3 * max(cameras.width * cameras.height, len(self.frozen))):
+            return self._render(cameras, dynamic, background, moment_per_frame(moments, len(cameras)))
+
+    def _render(
+        self, cameras: Cameras, dynamic: Dynamic, background: Float[Tensor, "3"] | None, at: list[Moment | None]
+    ) -> Rendering:
         frames, gaps = [], []
         sets = with_added(dynamic_per_frame(dynamic, len(cameras)), at, cameras)
         for k, (moving, moment) in enumerate(zip(sets, at, strict=True)):

@@ -77,5 +77,5 @@ def color(
         return
     if colors.shape[1] not in (1, 4, 9, 16, 25):
         raise ValueError(f"spherical harmonics have 1, 4, 9, 16 or 25 coefficients, found {colors.shape[1]}")
-    center = np.linalg.inv(viewmat)[:3, 3].copy()
+    center = -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)  # a rotation's inverse, without the threads of a linear algebra
     share_out(_color, workers(), colors, means, center, splats)

@@ -18,6 +18,7 @@ from pgsd_nerfstudio.dynamics.sparkle import Sparkle
 from pgsd_nerfstudio.effects import Effect, InitialLook, initial_look
 from pgsd_nerfstudio.physics.record.history import ParticleHistory
 from pgsd_nerfstudio.physics.record.report import report
+from pgsd_nerfstudio.rendering.compilation import small_steps
 from pgsd_nerfstudio.response.answer import Answer, Shown
 from pgsd_nerfstudio.response.landed import in_place
 from pgsd_nerfstudio.response.prepare import to_metric
@@ -113,12 +114,13 @@ class Weather:
         """
         place = self.scene.frame
         eye = None if camera is None else Eye.of(camera, self.prepared.rasterizer.config, place)
-        with torch.no_grad():
+        with torch.no_grad(), small_steps(3 * self.options.particles):
             return place.gaussians_to_scene(self.sequence.gaussians(frame, eye=eye))
 
     def moment(self, frame: int) -> Shown | None:
         """The answer of the frozen scene at a frame; None where it still looks as it was trained."""
-        return self.answer.at(frame / self.fps)
+        with small_steps(3 * len(self.scene.gaussians)):
+            return self.answer.at(frame / self.fps)
 
     def render(self, camera: Cameras, second: float) -> Picture:
         """What a camera sees at a second.
