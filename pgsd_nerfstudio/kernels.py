@@ -23,17 +23,18 @@ from pgsd_nerfstudio import vectors as vectors  # before the first kernel
 Stamp = tuple[Any, ...]
 
 
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def kernel(*, also: Stamp = (), **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator that compiles a function as a kernel, which releases the interpreter's lock.
 
     Args:
+        also: stamp of what the kernel contains besides, which its module does not show.
         **options: further options of `numba.njit`.
     """
 
     def decorate(function: FunctionType) -> Any:
         made: Any = numba.njit(cache=True, nogil=True, **options)(function)
         # numba compares this with the stamp in its index of compiled functions; there is no public way to set it.
-        made._cache._cache_file._source_stamp = stamp(function.__globals__)
+        made._cache._cache_file._source_stamp = (*also, *stamp(function.__globals__))
         return made
 
     return decorate
@@ -48,7 +49,7 @@ def stamp(names: Mapping[str, Any]) -> Stamp:
     own = names["__name__"]
     called = sorted({value.py_func.__module__ for value in names.values() if isinstance(value, CPUDispatcher)} - {own})
     constants = sorted((name, repr(value)) for name, value in _constants(names))
-    return _file(names["__file__"]), *map(_of_module, called), *constants
+    return file_stamp(Path(names["__file__"])), *map(_of_module, called), *constants
 
 
 @cache
@@ -56,10 +57,9 @@ def _of_module(name: str) -> Stamp:
     return stamp(vars(sys.modules[name]))
 
 
-def _file(path: str) -> tuple[str, float, int]:
-    """Name, time of the last change and size in bytes."""
-    source = Path(path)
-    return source.name, source.stat().st_mtime, source.stat().st_size
+def file_stamp(path: Path) -> tuple[str, float, int]:
+    """Name of a file, time of its last change and size in bytes."""
+    return path.name, path.stat().st_mtime, path.stat().st_size
 
 
 def _constants(names: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

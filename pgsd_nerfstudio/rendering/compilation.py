@@ -1,7 +1,7 @@
 """Compilation of this room's numba kernels, and their work on several threads.
 
-Compiled kernels are kept on disk and compiled anew when any file of this room changes: kernels call each other and read
-constants from several files, whereas numba by itself checks only the file of the kernel.
+Kernels are compiled anew when any file of this room changes: a walk that numba chooses by the type of an argument (walk.py) is
+not among the kernels that a module imports, which is all that `kernels` follows.
 
 The threads are Python's own; they run in parallel since kernels release the interpreter's lock. numba's `parallel=True` would
 do the same for twice the compilation, and its OpenMP threads spin while they wait for those of torch.
@@ -16,14 +16,14 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numba
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from pgsd_nerfstudio import vectors as vectors  # before the first kernel
+from pgsd_nerfstudio import kernels
+from pgsd_nerfstudio.kernels import file_stamp
 
 FEW = 1_000_000  # numbers up to which a step of torch is short
 
@@ -32,28 +32,12 @@ _MATH = {"reassoc", "contract", "arcp", "nsz", "afn"}
 
 
 def room_stamp(folder: Path) -> tuple[tuple[str, float, int], ...]:
-    """Name, time of the last change and size in bytes of every source file of a folder."""
-    return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in sorted(folder.glob("*.py")))
+    """Stamps of all source files of a folder."""
+    return tuple(map(file_stamp, sorted(folder.glob("*.py"))))
 
 
-_STAMP = room_stamp(Path(__file__).parent)
-
-
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a function as a kernel for one thread.
-
-    Args:
-        **options: further options of `numba.njit`.
-    """
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_MATH, **options)(function)
-        # numba compares this with the stamp in its index of compiled functions; there is no public way to set it.
-        made._cache._cache_file._source_stamp = _STAMP
-        return made
-
-    return decorate
-
+kernel = partial(kernels.kernel, also=room_stamp(Path(__file__).parent), error_model="numpy", fastmath=_MATH)
+"""Decorator that compiles a function as a kernel for one thread; it takes further options of `numba.njit`."""
 
 inlined = partial(numba.njit, inline="always")
 """Decorator of a function whose source numba puts into the kernels that call it, where their options hold for it."""

@@ -17,6 +17,7 @@ from pgsd_nerfstudio.rendering.display import encoded, linear
 from pgsd_nerfstudio.rendering.medium import Medium
 from pgsd_nerfstudio.rendering.moment import Gaps, Viewpoint
 from pgsd_nerfstudio.response.airlight import thinned
+from pgsd_nerfstudio.response.patchiness import smooth_step
 from pgsd_nerfstudio.response.sky import overcast, reach
 
 LEAST = 0.05  # share of the light in a gap below which nothing is seen through it; a white sky would add a twentieth
@@ -55,8 +56,7 @@ def behind_gaps(
     rays = normalize(local, dim=1) @ view.viewmat[:3, :3]
     height = (rays @ up.T.to(rays))[:, 2]
     low, high = OPEN
-    opened = ((gaps.light[seen] - low) / (high - low)).clamp(0, 1)
-    opened = (opened * opened * (3 - 2 * opened)).to(own)
+    opened = smooth_step((gaps.light[seen] - low) / (high - low)).to(own)
     light = linear(own).expand(len(rays), 3)
     if medium is not None:
         units = gaps.depth[seen].to(own) * local.norm(dim=1)

@@ -115,9 +115,3 @@ def reach(outside: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 def _amplitudes(lengths: Float[Tensor, " w"], outside: Float[Tensor, "*n"]) -> Float[Tensor, "*n w"]:
     return -STEEP * lengths * torch.expm1(-(FLAT + outside[..., None]) / lengths)
-
-
-def smooth_step(x: Tensor) -> Tensor:
-    """A cubic from 0 at 0 to 1 at 1 that is level at both ends."""
-    x = x.clamp(0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)

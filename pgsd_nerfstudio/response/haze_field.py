@@ -26,8 +26,9 @@ from pgsd_nerfstudio.physics.air.arrival import Arrival
 from pgsd_nerfstudio.physics.clock import Domain
 from pgsd_nerfstudio.physics.laws import populations
 from pgsd_nerfstudio.rendering.medium import Froxels, Lengths, Medium
-from pgsd_nerfstudio.response.front import Front, smooth_step
+from pgsd_nerfstudio.response.front import Front
 from pgsd_nerfstudio.response.patches import Patches
+from pgsd_nerfstudio.response.patchiness import smooth_step
 from pgsd_nerfstudio.response.shown_share import ShownShare
 from pgsd_nerfstudio.scene.frame import Frame
 from pgsd_nerfstudio.storage import content_key

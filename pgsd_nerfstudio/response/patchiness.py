@@ -55,8 +55,13 @@ def hidden_share(share: Float[Tensor, " n"], rank: Float[Tensor, " n"]) -> Float
         share: mean share of the surface that is hidden at each place.
         rank: of each place.
     """
-    x = ((share * (1 + EDGE) - rank) / EDGE).clamp(0, 1)
-    return x * x * (3 - 2 * x)
+    return smooth_step((share * (1 + EDGE) - rank) / EDGE)
+
+
+def smooth_step(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """A cubic from 0 at 0 to 1 at 1 that is level at both ends."""
+    x = x.clamp(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 def fallen_until_hidden(rate: Float[Tensor, " n"], rank: Float[Tensor, " n"], hides: float) -> Float[Tensor, " n"]:
